@@ -165,7 +165,7 @@ LOGS = {  # name: (the change of train/01.csv, the words of the message: place |
     "rate never measured": (_column("dtheta1", lambda x: x * np.nan), "column 'dtheta1' | no sample | [measurement]"),
     "wrapped": (
         _column("theta1", _wrap),
-        "line 125, column 'theta1' | jumps by 6.283, in 2 places | import --unwrap theta1",
+        "line 125, column 'theta1' | jumps by 6.283, in 2 places | --unwrap theta1",
     ),
     "wrapped degrees": (
         _column("theta1", lambda x: np.degrees(_wrap(x))),

@@ -1,5 +1,8 @@
 """Counters that start over: jumps of one size are found and unwrapped exactly, and nothing that machines do is one."""
 
+import glob
+import shlex
+
 import numpy as np
 import pytest
 from helpers import pendulum_rig, swing_rig
@@ -97,6 +100,23 @@ theta1 = { from = "counts", scale = 0.00015339807878856412 }
 )
 
 
+ROBOT = """format = 1
+name = "robot"
+[model]
+type = "equations"
+inputs = { w = "rad/s" }
+states = { px = "m", py = "m", th = "rad" }
+rates = { px = "r*w*cos(th)", py = "r*w*sin(th)", th = "r*w" }
+r = { mean = 0.03, std = 0.005 }
+[sampling]
+dt = 0.05
+input_hold = "zero-order"
+clock = "sequence"
+[measurement]
+columns = { x = "px", y = "py", yaw = "th" }
+"""
+
+
 @pytest.fixture
 def motor(tmp_path):
     """12 bits of a motor before a gear of 10, at times between those of the rows, and a folder."""
@@ -122,7 +142,9 @@ def test_nothing_is_interpolated_across_a_jump(motor, capsys):
     off = (theta - np.interp(t, T, ANGLE) + turn / 2) % turn - turn / 2
     assert 5 < np.isnan(off).sum() < 100
     assert np.nanmax(np.abs(off)) < 5e-4
-    with pytest.raises(DataError, match=r"column 'theta1': jumps by 0.6283, in \d+ places, .* import --unwrap theta1"):
+    with pytest.raises(
+        DataError, match=r"column 'theta1': jumps by 0.6283, in \d+ places, .* import LOG ... .* --unwrap theta1"
+    ):
         read_logs(motor / "out/train", swing_rig(measured=("theta1",)))
 
 
@@ -130,6 +152,30 @@ def test_a_counter_is_unwrapped_as_asked(motor):
     t, theta = _imported(motor, "--unwrap", "theta1").T
     assert np.isfinite(theta).all()
     np.testing.assert_allclose(theta, np.interp(t, T, ANGLE) - ANGLE[0] + theta[0], rtol=0, atol=5e-4)
+
+
+def test_the_line_of_a_refused_data_set_takes_the_jumps_out(tmp_path, capsys):
+    """As it stands, in a folder whose name has a blank; of equations with three states, too."""
+    folder = tmp_path / "my bench"
+    t, heading = 0.05 * np.arange(200), np.linspace(3, 8, 200)
+    for part in ("train/a", "train/b", "test/a"):
+        values = {
+            "time": t,
+            "w": np.ones(200),
+            "x": np.cos(t),
+            "y": np.sin(t),
+            "yaw": (heading + np.pi) % (2 * np.pi) - np.pi,
+        }
+        write_csv(folder / f"{part}.csv", values)
+    (folder / "rig.toml").write_text(ROBOT)
+    assert cli.main(["check", str(folder)]) == 2
+    line = capsys.readouterr().err.partition("take the jumps out: nnap-em ")[2].strip()
+    words = [word for text in shlex.split(line) for word in (sorted(glob.glob(text)) if "*" in text else [text])]
+    assert cli.main([str(tmp_path / "new") if word == "NEW" else word for word in words]) == 0
+    files = sorted((tmp_path / "new").glob("*/*.csv"))
+    assert len(files) == 3
+    for file in files:
+        np.testing.assert_allclose(read_table(file, ("time",), ("yaw",))[:, 1], heading, atol=1e-9)
 
 
 def test_a_column_that_is_not_there_is_not_unwrapped(motor, capsys):

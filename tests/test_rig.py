@@ -1,13 +1,16 @@
 """rig.toml: what is declared comes back, what is wrong is refused by name and with a hint."""
 
+import dataclasses
 import re
 import shutil
+import tomllib
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from nnap_em.data.rig import Declared, Rig, RigError, SystemSpec, nearest, read_rig, write_rig
+from nnap_em.data.limits import Bounds
+from nnap_em.data.rig import Declared, Rig, RigError, SystemSpec, flat, nearest, read_rig, write_rig
 from nnap_em.data.units import parameter_unit
 from nnap_em.storage.files import replace_text
 from nnap_em.systems import specs
@@ -287,3 +290,26 @@ def test_a_file_is_replaced_whole_or_not_at_all(tmp_path):
 def test_nearest_prefers_the_same_letters_in_another_case():
     assert nearest("I1", ("l1", "i1")).startswith("did you mean 'i1'?")
     assert nearest("velocity", ("l1", "i1")) == "possible here: l1, i1"
+
+
+ODD = ("joint 1 [rad]", "a.b", 'Gelenk ä"', "limits", "x#y", "-", "1")
+
+
+@pytest.mark.parametrize("name", ODD)
+def test_a_name_of_any_letters_comes_back(tmp_path, name):
+    """Of states, readings, inputs, limits and parameters."""
+
+    rig = Rig(
+        name=name, system="odd", parameters={f"{name}.mass": Declared(1.0, 0.1), f"{name}.mass of it": Declared(1.0, 0.0)},
+        friction=True, input_columns=(f"u {name}",), input_joints=(1,), dt=0.01, clock="session",
+        measured=(name, f"d{name}"), noise_std={name: 0.1, f"d{name}": 0.2}, start={f"d{name}": Declared(0.0, 1.0)},
+        limits=Bounds({f"d{name}": (-1.0, 2.0)}, {f"u {name}": (-3.0, 3.0)}, {name: (0.5, 0.5)}),
+        input_kinds=("velocity",),
+    )  # fmt: skip
+    rig = dataclasses.replace(rig, parameters={**rig.parameters, f"u {name}.kv": Declared(2.0, 0.5)})
+    write_rig(rig, tmp_path / "rig.toml")
+    table = tomllib.loads((tmp_path / "rig.toml").read_text())
+    assert table["start"] == {f"d{name}": {"mean": 0.0, "std": 1.0}} and table["name"] == name
+    assert set(dict(flat(table["measurement"]["noise_std"]))) == {name, f"d{name}"}
+    assert table["limits"] == {f"d{name}": [-1.0, 2.0], "rate": {f"u {name}": [-3.0, 3.0]}, "start": {name: [0.5, 0.5]}}
+    assert table["input"][f"u {name}"]["kv"] == {"mean": 2.0, "std": 0.5}

@@ -294,7 +294,7 @@ def _sequence(source: _Table, entries: Sequence[Rough], rig: Rig) -> _Sequence:
     for finding in implausible(inputs, readings, rig.dt, rig.unit, rig.pairs()):
         where = place(path, finding.column, None if finding.row is None else int(line[finding.row]))
         if finding.ruins:
-            refuse(path, where, finding.problem, finding.hint)
+            refuse(path, where, finding.problem, finding.mend(path))
         warnings.warn(f"{path}: {where}: {finding.problem}; {finding.hint}", DataWarning, 2)
     masked = [*source.masked, *(_masked(source, entry.kind, entry.column, entry.rows) for entry in entries)]
     return _Sequence((t, u, y), (t, u, read), masked)

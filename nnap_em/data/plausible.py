@@ -3,7 +3,9 @@ copies.
 """
 
 import math
+import shlex
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -16,6 +18,7 @@ from .units import parameter_unit
 Columns = Mapping[str, Float[np.ndarray, " time"]]
 STRETCH = 20  # rows that two sequences do not have in common by chance
 _DEGREES = "it looks like degrees: write rad and rad/s"
+_LOGS = "LOG ... --rig rig.toml"
 _ANGLE = (  # factor of an angle's rate of change over its rate column, the wrong one of the two, and the hint
     (math.degrees(1), "", _DEGREES),
     (math.radians(1), "d", _DEGREES),
@@ -38,6 +41,16 @@ class Implausible(NamedTuple):
     row: int | None
     problem: str
     hint: str
+
+    def mend(self, path: Path) -> str:
+        """The hint with the logs of the data set that a file stands in, where these are no copies of other logs."""
+        home = path.parent.parent
+        rig = home / "rig.toml"
+        if not rig.is_file() or "[import.columns]" in rig.read_text(errors="replace"):
+            return self.hint
+        folders = [home / part for part in ("train", "test") if (home / part).is_dir()] or [path.parent]
+        logs = " ".join(f"{shlex.quote(str(folder))}/*" for folder in folders)
+        return self.hint.replace(_LOGS, f"{logs} --rig {shlex.quote(str(rig))}")
 
 
 class Repeat(NamedTuple):
@@ -185,7 +198,10 @@ def _wrapped(name: str, values: Float[np.ndarray, " time"], unit: str) -> Iterat
     rate = unit.endswith("/s")
     found = counter(values, np.arange(values.size, dtype=float), angle=unit == "rad", rate=rate)
     if found is not None:
-        row, hint = int(found.rows[0]), f"take the jumps out: nnap-em import --unwrap {name}"
+        row, hint = (
+            int(found.rows[0]),
+            f"take the jumps out: nnap-em import {_LOGS} --out NEW --unwrap {shlex.quote(name)}",
+        )
         hint += " (and convert degrees to rad)" if found.size == 360.0 and not rate else ""
         problem = f"{found}, in {counted(found.rows.size, 'place')}, here to {values[row]:.6g}"
         yield Implausible(True, name, row, problem, hint)

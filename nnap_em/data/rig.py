@@ -5,6 +5,7 @@ import difflib
 import functools
 import json
 import math
+import re
 import tomllib
 import warnings
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
@@ -273,7 +274,7 @@ def write_rig(rig: Rig, path: Path | str) -> None:
         name: repr(x.mean) if x.std == 0 and name not in scales else _pair(x, scales.get(name, ""))
         for name, x in rig.parameters.items()
     }
-    bodies = [f"{key} = {parameters[key]}    # {rig.unit(key)}" for key in rig.bodies]
+    bodies = [f"{dotted_key(key)} = {parameters[key]}    # {rig.unit(key)}" for key in rig.bodies]
     lines = ["format = 1", f"name = {toml_text(rig.name)}", "", "[model]", f"type = {toml_text(rig.system)}"]
     lines += [f"file = {toml_text(unpacked(rig.machine).file)}", *_part(rig)] if rig.machine else bodies
     lines += _equations(rig) if rig.equations else _joints(rig, parameters, bodies)
@@ -290,9 +291,10 @@ def write_rig(rig: Rig, path: Path | str) -> None:
     names = f"[{', '.join(map(toml_text, rig.measured))}]"
     lines += ["", "[measurement]", f"columns = {_inline(reads) if readings else names}"]
     lines += [f"range = {_inline({name: list(ends) for name, ends in rig.ranges.items()})}"] if rig.ranges else []
-    lines += ["", "[measurement.noise_std]", *(f"{n} = {std!r}    # {rig.unit(n)}" for n, std in rig.noise_std.items())]
+    lines += ["", "[measurement.noise_std]"]
+    lines += [f"{dotted_key(name)} = {std!r}    # {rig.unit(name)}" for name, std in rig.noise_std.items()]
     lines += ["", "[start]    # prior of the first row"]
-    lines += [f"{name} = {_pair(x)}    # {rig.unit(name)}" for name, x in rig.start.items()]
+    lines += [f"{toml_key(name)} = {_pair(x)}    # {rig.unit(name)}" for name, x in rig.start.items()]
     lines += _limits(rig.limits)
     replace_text(Path(path), "\n".join(lines) + "\n")
 
@@ -318,13 +320,15 @@ def _equations(rig: Rig) -> list[str]:
     lines = [
         f"{key} = {_inline(names) if all(names.values()) else json.dumps(list(names))}" for key, names in parts.items()
     ]
-    lines += ["", "[model.units]", *(f"{name} = {toml_text(unit)}" for name, unit in known.items())] if known else []
+    lines += (
+        ["", "[model.units]", *(f"{toml_key(n)} = {toml_text(unit)}" for n, unit in known.items())] if known else []
+    )
     terms = {name: ("", signals) for name, signals in of["terms"].items()} | dict(of["enters"])
     entries = {
         name: {"signals": signals} | ({"enters": port} if port else {}) for name, (port, signals) in terms.items()
     }
     return lines + (
-        ["", "[model.unknown]", *(f"{n} = {_inline(entry)}" for n, entry in entries.items())] if terms else []
+        ["", "[model.unknown]", *(f"{toml_key(n)} = {_inline(entry)}" for n, entry in entries.items())] if terms else []
     )
 
 
@@ -349,6 +353,16 @@ def _part(rig: Rig) -> list[str]:
 def toml_text(text: str) -> str:
     """A text as TOML writes it."""
     return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")  # TOML escapes as JSON does, save for DEL
+
+
+def toml_key(name: str) -> str:
+    """A name as a key of TOML, in quotes where it has to be."""
+    return name if re.fullmatch(r"[\w-]+", name, re.ASCII) else toml_text(name)
+
+
+def dotted_key(name: str) -> str:
+    """A name with dots as tables inside tables, which `flat` joins again."""
+    return ".".join(map(toml_key, name.split(".")))
 
 
 def flat(items: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, object]]:
@@ -553,7 +567,7 @@ def _limits(limits: Bounds) -> list[str]:
         line
         for name, table in tables.items()
         if table
-        for line in ("", f"[{name}]", *(f"{key} = {list(pair)!r}" for key, pair in table.items()))
+        for line in ("", f"[{name}]", *(f"{toml_key(key)} = {list(pair)!r}" for key, pair in table.items()))
     ]
 
 

@@ -57,7 +57,7 @@ def si(unit: str) -> tuple[str, float]:
 
 
 def factor(unit: str, other: str) -> float | None:
-    """How many of the other unit one is; NaN where they measure different things, None where one is unknown."""
+    """Size of one unit in the other; NaN where they measure different things, None where one is unknown."""
     one, two = _parsed(unit), _parsed(other)
     if one is None or two is None:
         return None

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from ..data.dataset import DataError
 from ..data.formats import csv_fields, header_hint, number, place, refuse
 from ..data.noise import reading_noise
-from ..data.rig import SystemSpec, toml_text
+from ..data.rig import SystemSpec, dotted_key, toml_key, toml_text
 from ..data.units import UNITS, named_unit, parameter_unit, si
 
 _NAMES = {  # what people call a column, its number apart
@@ -217,11 +217,11 @@ def measurement(
     for name in measured:
         noise = reading_noise(table[name][None])
         sure = 0 < noise < 0.3 * np.nanstd(table[name])
-        yield f"{'' if sure else '# '}{name} = {noise:.2g}    # {unit(name)}"
+        yield f"{'' if sure else '# '}{dotted_key(name)} = {noise:.2g}    # {unit(name)}"
     yield from ("", "[start]    # the state in the first row, where it is known but not measured")
     for name in spec.states:
         if name not in measured:
-            yield f"# {name} = {{ mean = 0.0, std = 0.5 }}    # {unit(name)}; may be left out"
+            yield f"# {toml_key(name)} = {{ mean = 0.0, std = 0.5 }}    # {unit(name)}; may be left out"
 
 
 def _notes(columns: Sequence[_Column], spec: SystemSpec) -> Iterator[str]:

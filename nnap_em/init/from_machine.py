@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from ..data.dataset import DataError
 from ..data.machine import SENSE_UNITS, Machine, machine_unit, packed, states
-from ..data.rig import SystemSpec, toml_text
+from ..data.rig import SystemSpec, dotted_key, toml_text
 from ..data.servo import TORQUE
 from ..import_.files import reader
 from ..import_.recording import Address, Topic, places
@@ -151,14 +151,16 @@ def _model(machine: Machine, file: str, held: Mapping[str, float]) -> Iterator[s
     )
     for body in machine.bodies:
         if body.mass > 0:
-            yield f"# {body.name}.mass = {{ std = {0.1 * body.mass:.2g} }}    # kg; {body.mass:.4g} in the file"
+            key = dotted_key(f"{body.name}.mass")
+            yield f"# {key} = {{ std = {0.1 * body.mass:.2g} }}    # kg; {body.mass:.4g} in the file"
     for joint in machine.joints:
         unit = "kg" if joint.slide else "kg m^2"
         geared = "geared" if joint.reduction == 1 else f"times {joint.reduction:g}^2"
         size = (
             f"{joint.armature:.4g} in the file" if joint.armature else f"0 in the file: inertia of the rotor, {geared}"
         )
-        yield f"# {joint.name}.armature = {{ std = {joint.armature or 0.01:.2g} }}    # {unit}; {size}"
+        key = dotted_key(f"{joint.name}.armature")
+        yield f"# {key} = {{ std = {joint.armature or 0.01:.2g} }}    # {unit}; {size}"
 
 
 def _driven(machine: Machine, joints: Mapping[str, str]) -> Iterator[str]:

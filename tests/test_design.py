@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import os
 import re
 from pathlib import Path
 
@@ -266,8 +267,8 @@ def test_the_command_writes_what_can_be_played_and_a_page(slide, designed):
     assert not (designed / "unfinished").exists()
 
 
-def test_old_and_new_logs_are_fitted_together(slide, designed, tmp_path, capsys):
-    """The new logs are the old ones with other names and other noise: all are there, each once."""
+def test_old_and_new_logs_are_fitted_together(slide, designed, tmp_path, capsys, monkeypatch):
+    """The new logs are the old ones with other names and other noise: all are there, each once, from another folder."""
     folder, _, data, _ = slide
     new = tmp_path / "new"
     new.mkdir()
@@ -275,7 +276,9 @@ def test_old_and_new_logs_are_fitted_together(slide, designed, tmp_path, capsys)
         rows = [f"{t:.2f},{a[0]!r},{b[0] + 1e-4!r}" for t, a, b in zip(data.t[i], u.tolist(), y.tolist(), strict=True)]
         (new / f"{i}.csv").write_text("\n".join(["time,u,x", *rows]) + "\n")
     out = tmp_path / "fit"
-    assert nnap("identify", folder, "--more", new, "--out", out, "--epochs", 2, "--quiet") == 0
+    monkeypatch.chdir(folder)
+    assert nnap("identify", ".", "--more", os.path.relpath(new, folder), "--out", out, "--epochs", 2, "--quiet") == 0
+    monkeypatch.chdir(tmp_path)
     assert "to 24 sequences" in json.loads((out / "report.json").read_text())["verdict"]
     from nnap_em.fit.store import read
 

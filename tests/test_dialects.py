@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 from recorders import ns, plain_json, write_hdf5, write_mcap
 
 from nnap_em.commands import cli
+from nnap_em.data import formats
 from nnap_em.data.dataset import DataError
 from nnap_em.data.logs import DataWarning, read_logs
 from nnap_em.data.rig import RigError, read_rig
@@ -391,6 +392,32 @@ def test_a_plain_csv_file_is_none_of_another_dialect(tmp_path):
         assert not text_file.foreign(dialects.table(tmp_path / "a.csv", header, (T, U, Q)))
     for header in ('time,"a, b",c', "time,a,a", "# time,a,b"):
         assert text_file.foreign(dialects.table(tmp_path / "a.csv", header, (T, U, Q)))
+
+
+def test_a_codesys_trace_with_a_line_of_its_own_is_read(tmp_path):
+    log = dialects.codesys(tmp_path / "a.trace.csv")
+    log.write_text(log.read_text().replace("Flags; 16", "Flags\nComment\n;\n\nFlags;"))
+    (table,) = _imported(log, _rig(tmp_path))
+    np.testing.assert_allclose(table.T, [U[: len(table)], Q[: len(table)], V[: len(table)]], atol=2e-8)
+
+
+@pytest.mark.parametrize("rows", [0, 1])
+def test_a_table_of_lists_without_rows_is_refused(tmp_path, rows):
+    lists = pa.array([[1.0, 2.0]] * rows, pa.list_(pa.float64()))
+    pq.write_table(pa.table({"time": pa.array([0.0] * rows, pa.float64()), "state": lists}), tmp_path / "a.parquet")
+    with pytest.raises(DataError, match=rf"a\.parquet: the file: found {rows} rows?; write 2 rows or more"):
+        reader(tmp_path / "a.parquet").topics(tmp_path / "a.parquet")
+
+
+def test_names_that_need_quotation_marks_come_back(tmp_path):
+    """From a table with such a header through the data set that `import` writes."""
+    names = ["time", 'u, "raw"', "theta1", "dtheta1"]
+    formats.write_csv(tmp_path / "a.csv", dict(zip(names, COLUMNS, strict=True)))
+    rig = tmp_path / "rig.toml"
+    rig.write_text(RIG.replace('["u"]', "['u, \"raw\"']"))
+    assert cli.main(["import", str(tmp_path / "a.csv"), "--rig", str(rig), "--out", str(tmp_path / "out")]) == 0
+    logs = read_logs(tmp_path / "out/train", read_rig(tmp_path / "out/rig.toml", specs))
+    np.testing.assert_allclose(logs.data.u[0, :, 0], U, atol=1e-9)
 
 
 _lines = st.lists(st.lists(st.text('0159.,;-eE\t"#NameTrueX_Value[]°', max_size=7), max_size=4), max_size=9)

@@ -50,6 +50,13 @@ def test_joints_are_counted_in_the_order_of_their_topic():
     }  # fmt: skip
 
 
+def test_a_log_of_single_messages_is_refused(tmp_path):
+    note = [{"pos": 0.1, "vel": 0.0, "u": 0.5}]
+    log = write_mcap(tmp_path / "a.mcap", {"/slide": (plain_json(), ns(T[:1]), note)})
+    with pytest.raises(DataError, match=r"a\.mcap: its topics have one message each; give a log of a motion"):
+        draft_recorded(log, None, specs)
+
+
 def test_a_log_without_a_machine_is_refused(tmp_path):
     log = write_mcap(tmp_path / "a.mcap", {"/rosout": (plain_json(), ns(T[:9]), [{"level": 3}] * 9)})
     with pytest.raises(DataError, match=r"no topic looks like joints or torques \(topics: /rosout\); write rig.toml"):

@@ -298,10 +298,10 @@ ODD = ("joint 1 [rad]", "a.b", 'Gelenk ä"', "limits", "x#y", "-", "1")
 @pytest.mark.parametrize("name", ODD)
 def test_a_name_of_any_letters_comes_back(tmp_path, name):
     """Of states, readings, inputs, limits and parameters."""
-
     rig = Rig(
-        name=name, system="odd", parameters={f"{name}.mass": Declared(1.0, 0.1), f"{name}.mass of it": Declared(1.0, 0.0)},
-        friction=True, input_columns=(f"u {name}",), input_joints=(1,), dt=0.01, clock="session",
+        name=name, system="odd", friction=True,
+        parameters={f"{name}.mass": Declared(1.0, 0.1), f"{name}.mass of it": Declared(1.0, 0.0)},
+        input_columns=(f"u {name}",), input_joints=(1,), dt=0.01, clock="session",
         measured=(name, f"d{name}"), noise_std={name: 0.1, f"d{name}": 0.2}, start={f"d{name}": Declared(0.0, 1.0)},
         limits=Bounds({f"d{name}": (-1.0, 2.0)}, {f"u {name}": (-3.0, 3.0)}, {name: (0.5, 0.5)}),
         input_kinds=("velocity",),

@@ -1,6 +1,7 @@
 """Files of machines as people have them: xacro, transmissions, links without mass, lines of the user's own file."""
 
 import warnings
+import xml.etree.ElementTree as ET
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -13,6 +14,7 @@ from nnap_em.data.rig import Declared, RigWarning, read_rig
 from nnap_em.init.from_machine import draft_machine
 from nnap_em.machines.mjcf import Part, read_machine
 from nnap_em.machines.source import MachineError
+from nnap_em.machines.spec import in_comment
 from nnap_em.systems import specs
 
 MASS = '<inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>'
@@ -63,6 +65,12 @@ def test_what_xacro_leaves_behind_is_no_macro(tmp_path):
     rest = "<gazebo><plugin><file>$(find a)/b.yaml</file></plugin></gazebo>"
     path = _urdf(tmp_path, ARM.replace(MASS, shape + MASS) + rest, XACRO)
     assert [joint.name for joint in read_machine(path).joints] == ["j1", "j2"]
+
+
+def test_a_name_with_dashes_may_stand_in_a_comment():
+    for text in ("a--b", "a---b", "--", "- -", "a-b"):
+        assert ET.fromstring(f"<a><!-- {in_comment(text)} --></a>").tag == "a"
+    assert in_comment("a---b") == "a- - -b" and in_comment("a-b") == "a-b"
 
 
 # --- transmissions

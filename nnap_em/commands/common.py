@@ -18,7 +18,7 @@ import numpy as np
 
 from ..comparison.compare import CompareError
 from ..data.dataset import DataError, Dataset
-from ..data.formats import has_logs, write_csv
+from ..data.formats import has_logs, header, write_csv
 from ..data.logs import DataWarning, Logs, check_split, read_logs, together
 from ..data.rig import Rig, RigError, RigWarning, read_rig
 from ..em.build import build_system, measure_scales
@@ -140,6 +140,11 @@ def read_training(rig: Rig, folders: Sequence[Path], trust: bool) -> Logs:
     return together(parts)
 
 
+def logs_at(args: argparse.Namespace) -> list[str]:
+    """The folders of the training logs, as they are found from any other."""
+    return [str(folder.resolve()) for folder in (args.folder, *args.more)]
+
+
 def logs_of(file: Path, stored: Stored, folders: Sequence[Path], trust: bool) -> tuple[Rig, Logs]:
     """Rig and training logs of the fit in `file`: of these folders, or of those that it names.
 
@@ -200,7 +205,7 @@ def write_states(folder: Path, logs: Logs, states: tuple[str, ...], mean, std) -
     """
     names = ("time", *states, *(f"{name}_std" for name in states))
     paths = [(folder / file).with_suffix(".csv") for file in logs.files]
-    check_own(paths, ",".join(names))
+    check_own(paths, header(names))
     for i, (file, path) in enumerate(zip(logs.files, paths, strict=True)):
         rows = np.asarray(logs.data.valid[i])
         values = np.concatenate([mean[i][rows], std[i][rows]], axis=1)

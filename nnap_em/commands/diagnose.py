@@ -22,7 +22,7 @@ from ..diagnosis.search import diagnose
 from ..fit.store import AFTER_FILE, fingerprint, save
 from ..report.diagnosis import write_diagnosis
 from ..storage.log import Log
-from .common import check_out, go_on, origin, own_logs, read_bench, remove_reports, resumable, warn_of_torques
+from .common import check_out, go_on, logs_at, origin, own_logs, read_bench, remove_reports, resumable, warn_of_torques
 
 
 def run(args: argparse.Namespace, log: Log) -> None:
@@ -53,7 +53,7 @@ def run(args: argparse.Namespace, log: Log) -> None:
         journal.open = not diagnosis.complete
         accepted, mark = findings(diagnosis), fingerprint(bench.train.data)
         remove_reports(args.out)
-        notes = {"settings": {"seed": args.seed}, "logs": list(map(str, (args.folder, *args.more)))}
+        notes = {"settings": {"seed": args.seed}, "logs": logs_at(args)}
         for name, fitted in (("before.npz", diagnosis.before), (AFTER_FILE, diagnosis.after)):
             save(args.out / name, fitted, fingerprint=mark, notes=notes)
         write_diagnosis(args.out, diagnosis, accepted, bench.train, bench.test, seed=args.seed, began=began, log=report)

@@ -31,7 +31,7 @@ from ..fit.store import MODEL_FILE, fingerprint, save
 from ..report.identification import write_identification
 from ..storage.log import Log
 from .cli import SMOOTHERS
-from .common import check_out, origin, read_bench, remove_reports, resumable, warn_of_torques
+from .common import check_out, logs_at, origin, read_bench, remove_reports, resumable, warn_of_torques
 
 MISFIT_STATUS = 3
 """Exit status of a fit that does not describe the motion."""
@@ -56,7 +56,7 @@ def run(args: argparse.Namespace, log: Log) -> int:
             fitted = with_memory(fitted, data, log)
         remove_reports(args.out)
         settings = {"smoother": args.smoother, "particles": args.particles, "seed": args.seed}
-        notes = {"settings": settings, "epochs": epochs, "logs": list(map(str, (args.folder, *args.more)))}
+        notes = {"settings": settings, "epochs": epochs, "logs": logs_at(args)}
         save(args.out / MODEL_FILE, fitted, fingerprint=fingerprint(data), notes=notes)
         described = write_identification(
             args.out, fitted, bench.train, bench.test, epochs,

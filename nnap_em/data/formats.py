@@ -3,7 +3,7 @@
 import csv
 import difflib
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from itertools import pairwise
 from pathlib import Path
@@ -96,7 +96,13 @@ def write_csv(path: Path, columns: Mapping[str, Sequence[float] | Real[Array, " 
     late = {name for name, values in table.items() if name == "time" and np.max(np.abs(values), initial=0.0) > 1e4}
     line = ",".join(["%r" if name in late else "%.12g" for name in table])
     body = "\n".join([line % row for row in zip(*(values.tolist() for values in table.values()), strict=True)])
-    replace_text(path, f"{','.join(table)}\n{body.replace('nan', '')}\n")
+    replace_text(path, f"{header(table)}\n{body.replace('nan', '')}\n")
+
+
+def header(names: Iterable[str]) -> str:
+    """Line 1 of a CSV file; names with a comma or quotation marks stand in these."""
+    quoted = ('"' + name.replace('"', '""') + '"' if set(name) & set(',"') else name for name in names)
+    return ",".join(quoted)
 
 
 def header_hint(path: Path) -> str | None:
@@ -211,6 +217,7 @@ def _parquet_file(path: Path) -> Any:
 def _parquet_columns(path: Path) -> dict[str, tuple[str, int | None]]:
     """The columns by their names; where a row holds a list, one for each entry of the first."""
     file, out = _parquet_file(path), {}
+    _enough(path, file.metadata.num_rows)
     with _damaged(path, "Parquet"):
         for field in file.schema_arrow:
             if "list" not in str(field.type):
@@ -409,11 +416,16 @@ def _no_number(path: Path, where: str, text: str, missing: bool, gaps: bool) -> 
     refuse(path, where, f"found {text}", hint + ("; time and inputs are never empty" * missing))
 
 
+def _enough(path: Path, rows: int) -> None:
+    """Refuse a table without motion."""
+    if rows < 2:
+        refuse(path, "the file", f"found {counted(rows, 'row')}", "write 2 rows or more")
+
+
 def _stack(path: Path, columns: Mapping[str, Any], gaps: Sequence[str], dates: bool) -> Table:
     """Columns of numbers side by side, checked as those of a CSV file are."""
     rows = np.size(next(iter(columns.values())))
-    if rows < 2:
-        refuse(path, "the file", f"found {counted(rows, 'row')}", "write 2 rows or more")
+    _enough(path, rows)
     out = []
     for name, values in columns.items():
         if dates and name not in gaps and values.dtype.kind in "MmOSU":

@@ -198,10 +198,8 @@ def _wrapped(name: str, values: Float[np.ndarray, " time"], unit: str) -> Iterat
     rate = unit.endswith("/s")
     found = counter(values, np.arange(values.size, dtype=float), angle=unit == "rad", rate=rate)
     if found is not None:
-        row, hint = (
-            int(found.rows[0]),
-            f"take the jumps out: nnap-em import {_LOGS} --out NEW --unwrap {shlex.quote(name)}",
-        )
+        row = int(found.rows[0])
+        hint = f"take the jumps out: nnap-em import {_LOGS} --out NEW --unwrap {shlex.quote(name)}"
         hint += " (and convert degrees to rad)" if found.size == 360.0 and not rate else ""
         problem = f"{found}, in {counted(found.rows.size, 'place')}, here to {values[row]:.6g}"
         yield Implausible(True, name, row, problem, hint)

@@ -320,9 +320,8 @@ def _equations(rig: Rig) -> list[str]:
     lines = [
         f"{key} = {_inline(names) if all(names.values()) else json.dumps(list(names))}" for key, names in parts.items()
     ]
-    lines += (
-        ["", "[model.units]", *(f"{toml_key(n)} = {toml_text(unit)}" for n, unit in known.items())] if known else []
-    )
+    units = [f"{toml_key(name)} = {toml_text(unit)}" for name, unit in known.items()]
+    lines += ["", "[model.units]", *units] if known else []
     terms = {name: ("", signals) for name, signals in of["terms"].items()} | dict(of["enters"])
     entries = {
         name: {"signals": signals} | ({"enters": port} if port else {}) for name, (port, signals) in terms.items()

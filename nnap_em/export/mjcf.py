@@ -14,7 +14,7 @@ from ..data.servo import TORQUE
 from ..effects import AbstractEffect
 from ..effects.presliding import PreslidingFriction
 from ..fit.identify import Identified
-from ..machines.spec import compiled, mujoco, written
+from ..machines.spec import compiled, in_comment, mujoco, written
 from ..model import hooks
 from ..model.state_space import StateSpaceModel
 from ..storage.files import replace_own
@@ -99,7 +99,7 @@ def write_mjcf(fitted: Identified, out: Path | str, *, alone: bool = False) -> l
         _motor(file, motor, element)
     notes = "".join(f"\n  - {line}" for line in left) or " nothing"
     comment = f"Written by nnap_em {__version__} from {system.machine.file}.  Not in here:{notes} "
-    file.spec.comment = f"{file.spec.comment}\n {comment.replace('--', '- -')}"
+    file.spec.comment = f"{file.spec.comment}\n {in_comment(comment)}"
     file.spec.compile()
     module = {beside(out): acting.text} if acting and acting.plays else {}
     replace_own({**module, out: written(file.spec, out.parent)})

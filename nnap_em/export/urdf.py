@@ -9,6 +9,7 @@ import numpy as np
 from .. import __version__
 from ..data.machine import Joint
 from ..fit.identify import Identified
+from ..machines.spec import in_comment
 from ..storage.files import replace_own
 from ..systems.tree import Tree
 from .friction import REPORTED_MISS, FrictionForm, friction_forms
@@ -48,9 +49,8 @@ def write_urdf(fitted: Identified, out: Path | str) -> list[str]:
         armature = float(system.values.get(f"{joint.name}.armature", joint.armature))
         left += [f"the armature of {joint.name}"] if armature else []
     root = ET.Element("robot", name=Path(system.machine.file).stem)
-    root.append(
-        ET.Comment(f" Written by nnap_em {__version__}.  No shapes.  Not in here: {'; '.join(left) or 'nothing'} ")
-    )
+    lost = in_comment("; ".join(left) or "nothing")
+    root.append(ET.Comment(f" Written by nnap_em {__version__}.  No shapes.  Not in here: {lost} "))
     ET.SubElement(root, "link", name=_base(system))
     numbers = _joints(fitted, forms)
     frames: list[tuple[str, np.ndarray]] = []

@@ -210,7 +210,7 @@ def _codesys(path: Path, lines: Sequence[str]) -> Iterator[Block]:
             y.append(rest[1])
         elif key.endswith("Variable"):
             name = " ".join(rest)
-        elif key == "Flags" and rest[0].isdecimal() and int(rest[0]) & 32:
+        elif key == "Flags" and rest and rest[0].isdecimal() and int(rest[0]) & 32:
             unit = "us"
     for name, (numbered, t, y) in parts.items():
         yield Block("time", _nanoseconds(path, "time", (numbered, t), unit, "."), {name: (numbered, y)}, ".")

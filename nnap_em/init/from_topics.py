@@ -83,7 +83,10 @@ def columns_table(path: Path, columns: Mapping[str, Address]) -> dict[str, Float
     """The columns on the rows of the fastest topic, for a look at interval and noise."""
     tracks = read(path, columns.values()).tracks
     origin = max(int(track.t[0]) for track in tracks.values())
-    dt = min(float(f"{np.median(np.diff(track.t)) * 1e-9:.3g}") for track in tracks.values() if track.t.size > 1)
+    steps = [np.median(np.diff(track.t)) * 1e-9 for track in tracks.values() if track.t.size > 1]
+    if not steps:
+        raise DataError(f"{path}: its topics have one message each; give a log of a motion")
+    dt = float(f"{min(steps):.3g}")
     end = min(int(track.t[-1]) for track in tracks.values())
     most = 100_000  # rows of the log from which its interval and noise are estimated
     at = dt * np.arange(min(max(int((end - origin) * 1e-9 / dt), 0), most))

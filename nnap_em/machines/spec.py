@@ -139,3 +139,8 @@ def _refuse(path: Path, message: str) -> NoReturn:
     matching = (hint for pattern, hint in hints.items() if re.search(pattern, message, re.I))
     hint = next(matching, "correct the file; MuJoCo's viewer shows the same error")
     refuse(path, f"MuJoCo's compiler refuses it: {message}", hint)
+
+
+def in_comment(text: str) -> str:
+    """A text as it may stand in a comment of XML, which has no two dashes in a row."""
+    return re.sub("-(?=-)", "- ", text)

@@ -185,7 +185,7 @@ NO_COLUMNS = {  # the change of a log, and words of the message
         "line 1: no column is recognised",
         "names such as time, u",
     ),
-    "dates": (lambda s: s.replace("\n", "\n2026-"), "column 'time': holds texts; write seconds"),
+    "dates": (lambda s: s.replace("\n", "\n2026-"), "column 'time': found '2026-0'; write seconds"),
 }
 
 

@@ -50,6 +50,21 @@ def test_joints_are_counted_in_the_order_of_their_topic():
     }  # fmt: skip
 
 
+def test_runs_with_times_of_day_are_drafted(tmp_path):
+    """Silences between runs are no readings without noise."""
+    rows, rng = ["Date,Time,Torque [Nm],Angle [deg]"], np.random.default_rng(0)
+    for run in range(4):
+        for k in range(300):
+            angle = 20 * np.sin(0.05 * k) + 0.1 * rng.normal()
+            rows.append(f"03.11.2026,12:{10 * run:02}:{k / 100:06.3f},{np.cos(0.1 * k):.6f},{angle:.6f}")
+    (tmp_path / "a.csv").write_text("\n".join(rows) + "\n")
+    assert cli.main(["init", str(tmp_path / "a.csv"), "--system", "pendulum"]) == 0
+    text = (tmp_path / "rig.toml").read_text()
+    assert "dt = 0.01 " in text and '"Torque" = "Torque [Nm]"' in text and '"theta1" = { from = "Angle [deg]"' in text
+    noise = float(re.search(r"(?m)^theta1 = ([\d.e-]+) ", text)[1])
+    assert noise == pytest.approx(np.radians(0.1), rel=0.2)  # a median of 1,200
+
+
 def test_a_log_of_single_messages_is_refused(tmp_path):
     note = [{"pos": 0.1, "vel": 0.0, "u": 0.5}]
     log = write_mcap(tmp_path / "a.mcap", {"/slide": (plain_json(), ns(T[:1]), note)})

@@ -15,7 +15,7 @@ import argparse
 from pathlib import Path
 
 from ..data.dataset import DataError
-from ..data.formats import column_names
+from ..data.formats import column_names, dated_csv
 from ..import_.recording import last_word
 from ..import_.text_file import foreign
 from ..init.equations import draft_equations
@@ -50,4 +50,4 @@ def _ours(path: Path) -> bool:
     """True for a CSV file that may stand in train/ as it is, but for names and units."""
     if path.suffix.lower() != ".csv" or not path.is_file() or foreign(path):
         return False
-    return all(last_word(name) == name for name in column_names(path))
+    return all(last_word(name) == name for name in column_names(path)) and not dated_csv(path)

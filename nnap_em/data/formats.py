@@ -19,7 +19,7 @@ from .dataset import Array, DataError
 from .dates import dated, moments
 from .mat_structs import mat_columns
 from .rig import nearest
-from .units import is_time
+from .units import clock_of, is_time
 
 LARGEST_FILE = 256 * 2**20  # bytes of the file of one sequence: some million rows
 TEXT_BYTES = 2**20  # bytes of text that are split at once, which take some 40 times as much memory
@@ -114,6 +114,14 @@ def header_hint(path: Path) -> str | None:
         return "line 1 holds numbers: write a header"
     above = "remove the lines above the header" if first.count(",") < last.count(",") else None
     return _separator_hint(path) or above
+
+
+def dated_csv(path: Path) -> bool:
+    """True for a CSV file whose times are dates or times of day."""
+    lines = read_bytes(path, 2**18).decode("utf-8-sig", errors="replace").splitlines()
+    names, row = split(lines[0]), split("".join(lines[1:2]))
+    clock = clock_of(names)[0]
+    return clock is not None and len(row) == len(names) and not _is_number(row[names.index(clock)])
 
 
 def untimed(path: Path, names: Sequence[str]) -> str | None:
@@ -406,8 +414,10 @@ def numbers(
     values = moments(texts) if dates else np.array([number(text, decimal) for text in texts])
     wrong = np.flatnonzero(np.isinf(values) | (np.isnan(values) & (not gaps)))
     if wrong.size:
-        k = int(wrong[0])
-        _no_number(path, f"line {lines[k]}, column {name!r}", repr(texts[k]), math.isnan(values[k]), gaps)
+        where, text = f"line {lines[int(wrong[0])]}, column {name!r}", repr(texts[int(wrong[0])])
+        if dates:
+            refuse(path, where, f"found {text}", "write seconds, or dates such as 2026-11-03T23:59:40.010")
+        _no_number(path, where, text, math.isnan(values[wrong[0]]), gaps)
     return values
 
 

@@ -19,13 +19,14 @@ def flatten(message: Any) -> dict[str, float]:
 
 def pick(message: Any, path: str) -> float:
     """The number at a path; NaN where the message has none."""
-    at, parent = message, None
+    at: Any = message
+    parent: Any = None
     while isinstance(at, Mapping) and path not in at and isinstance(at.get(path.partition(".")[0]), Mapping):
         head, _, path = path.partition(".")
         at = at[head]
-    whole = isinstance(at, Mapping) and path in at  # its name may have brackets
+    names = [path] if isinstance(at, Mapping) and path in at else steps(path)  # its own name may have brackets
     try:
-        for step in [path] if whole else steps(path):
+        for step in names:
             if isinstance(step, int):
                 at = at[step]
             elif step.startswith("["):

@@ -111,7 +111,7 @@ def numbers(path: Path) -> dict[str, Float[np.ndarray, " time"]]:
         if np.isinf(columns[name]).any():
             del columns[name]
             if meaning(name).kind == "time":
-                refuse(path, place(path, name), "holds texts", "write seconds")
+                refuse(path, place(path, name), "holds texts", "write seconds, or `nnap-em import` it")
     return columns
 
 

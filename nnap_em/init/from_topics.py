@@ -1,5 +1,6 @@
 """A first rig.toml from the topics of an MCAP or HDF5 log, with the table of addresses of all columns."""
 
+import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -12,6 +13,8 @@ from ..data.rig import SystemSpec, toml_text
 from ..data.units import named_unit, si
 from ..import_.files import read, reader
 from ..import_.recording import UNTIMED, Address, Topic, last_word, places
+from ..import_.segments import reach
+from ..import_.signals import Signal, interpolated
 from .from_log import Draft, drafted, meaning
 
 COMMAND = re.compile(r"cmd|command|torque|effort|tau|motor", re.IGNORECASE)
@@ -80,7 +83,7 @@ def addresses(topics: Sequence[Topic], columns: Mapping[str, Address]) -> Iterat
 
 
 def columns_table(path: Path, columns: Mapping[str, Address]) -> dict[str, Float[np.ndarray, " time"]]:
-    """The columns on the rows of the fastest topic, for a look at interval and noise."""
+    """The columns on the rows of the fastest topic, for a look at interval and noise; NaN where no reading is near."""
     tracks = read(path, columns.values()).tracks
     origin = max(int(track.t[0]) for track in tracks.values())
     steps = [np.median(np.diff(track.t)) * 1e-9 for track in tracks.values() if track.t.size > 1]
@@ -98,5 +101,6 @@ def columns_table(path: Path, columns: Mapping[str, Address]) -> dict[str, Float
         track = tracks[place.topic]
         y = track.values[place.path]
         t, y = (track.t - origin)[np.isfinite(y)] * 1e-9, y[np.isfinite(y)]
-        table[name] = (place.scale or 1.0) * np.interp(at, t, y) if y.size else 0 * at
+        signal = Signal(place.topic, t, (place.scale or 1.0) * y)
+        table[name] = interpolated(signal, at, dt, reach(signal, dt))[0] if y.size > 1 else np.full(at.size, math.nan)
     return table

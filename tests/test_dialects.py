@@ -5,6 +5,7 @@ import re
 from datetime import UTC, datetime, timedelta
 
 import dialects
+import h5py
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -138,6 +139,8 @@ def test_lists_and_episodes_of_lerobot_are_read(tmp_path, fixed):
 DEG = np.pi / 180
 NAMED = {  # the column and its name in the log, mapped as it stands; how many SI units it has, or words of the refusal
     "degrees": ("theta1", "Angle [deg]", DEG), "degree sign": ("theta1", "Angle (°)", DEG),
+    "a slash": ("theta1", "Winkel / °", DEG), "the word in": ("dtheta1", "Rate in deg/s", DEG),
+    "run together": ("theta1", "AngleDeg", DEG), "a path": ("u", "Drive/N", 1.0),
     "underscore": ("theta1", "angle_deg", DEG), "milliradians": ("theta1", "Angle [mrad]", 1e-3),
     "revolutions": ("theta1", "Angle [rev]", 2 * np.pi), "SI": ("theta1", "Angle [rad]", 1.0),
     "rpm": ("dtheta1", "Speed [RPM]", np.pi / 30), "U/min": ("dtheta1", "n [U/min]", np.pi / 30),
@@ -192,6 +195,19 @@ def test_a_unit_in_a_name_counts_in_every_format(tmp_path, suffix):
     names = {"u": "Torque [Nm]", "theta1": "Angle [deg]", "dtheta1": "Speed [rpm]"}
     (table,) = _imported(log, _rig(tmp_path, {name: f'"{topic}{at}"' for name, at in names.items()}))
     np.testing.assert_allclose(table[:-1].T, [U[: len(table) - 1], Q[: len(table) - 1], V[: len(table) - 1]], atol=1e-5)
+
+
+def test_a_unit_of_the_file_alone_counts(tmp_path):
+    """An attribute of HDF5, or a name that the mapping has without its unit."""
+    write_hdf5(tmp_path / "a.h5", {"a": {"time": T, "u": U, "q": np.stack([np.degrees(Q), V], 1), "v": V * 30 / np.pi}})
+    with h5py.File(tmp_path / "a.h5", "r+") as file:
+        file["a/v"].attrs["units"] = "rpm"
+        file["a/q"].attrs["unit"] = b"deg"
+    dialects.table(tmp_path / "a.csv", "time;u;q [deg];v (rpm)", (T, U, np.degrees(Q), V * 30 / np.pi), ";")
+    for name, theta1, start in (("a.h5", "/a:q[0]", "/a:"), ("a.csv", "q", "")):
+        rig = _rig(tmp_path, {"theta1": f'"{theta1}"', "dtheta1": f'"{start}v"', "u": f'"{start}u"'})
+        (table,) = _imported(tmp_path / name, rig)
+        np.testing.assert_allclose(table.T, [U[: len(table)], Q[: len(table)], V[: len(table)]], atol=1e-7)
 
 
 def test_a_unit_that_is_not_known_is_named(tmp_path):

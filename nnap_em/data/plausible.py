@@ -18,7 +18,6 @@ from .units import parameter_unit
 Columns = Mapping[str, Float[np.ndarray, " time"]]
 STRETCH = 20  # rows that two sequences do not have in common by chance
 _DEGREES = "it looks like degrees: write rad and rad/s"
-_LOGS = "LOG ... --rig rig.toml"
 _ANGLE = (  # factor of an angle's rate of change over its rate column, the wrong one of the two, and the hint
     (math.degrees(1), "", _DEGREES),
     (math.radians(1), "d", _DEGREES),
@@ -50,7 +49,7 @@ class Implausible(NamedTuple):
             return self.hint
         folders = [home / part for part in ("train", "test") if (home / part).is_dir()] or [path.parent]
         logs = " ".join(f"{shlex.quote(str(folder))}/*" for folder in folders)
-        return self.hint.replace(_LOGS, f"{logs} --rig {shlex.quote(str(rig))}")
+        return self.hint.replace("LOG ... --rig rig.toml", f"{logs} --rig {shlex.quote(str(rig))}")
 
 
 class Repeat(NamedTuple):
@@ -199,7 +198,7 @@ def _wrapped(name: str, values: Float[np.ndarray, " time"], unit: str) -> Iterat
     found = counter(values, np.arange(values.size, dtype=float), angle=unit == "rad", rate=rate)
     if found is not None:
         row = int(found.rows[0])
-        hint = f"take the jumps out: nnap-em import {_LOGS} --out NEW --unwrap {shlex.quote(name)}"
+        hint = f"take the jumps out: nnap-em import LOG ... --rig rig.toml --out NEW --unwrap {shlex.quote(name)}"
         hint += " (and convert degrees to rad)" if found.size == 360.0 and not rate else ""
         problem = f"{found}, in {counted(found.rows.size, 'place')}, here to {values[row]:.6g}"
         yield Implausible(True, name, row, problem, hint)

@@ -24,7 +24,6 @@ _SIZES = {  # names of units, how many of another unit each is, and that one; of
     "bar": (1e5, "Pa"), "l": (1e-3, "m^3"),
     **{unit: (1.0, unit) for unit in ("rad", "m", "s", "N", "kg", "A", "V", "W", "ohm", "Pa", "K", "°C")},
 }  # fmt: skip
-_PREFIXES = {"k": 1e3, "M": 1e6, "d": 0.1, "c": 1e-2, "m": 1e-3, "u": 1e-6, "µ": 1e-6, "μ": 1e-6, "n": 1e-9}
 _WORDS = ("deg/s", "°/s", "deg", "°", "rpm", "mm/s", "mm", "mnm", "nmm", "rad/s", "rad", "m/s", "nm", "n m", "n", "m",
           "ma", *UNITS)  # fmt: skip
 _TIME_NAMES = re.compile(
@@ -32,21 +31,20 @@ _TIME_NAMES = re.compile(
     re.IGNORECASE,
 )
 """Names of a column of times: __time of PlotJuggler, tout of Simulink, X_Value of LabVIEW."""
-_UNIT = re.compile(r"(?!(?:.*[./:])?(?:position|velocity|effort|data)\[)(.+?)[ _,]*[\[(]([^][()]+)[\])]")
-_WORD = re.compile(rf"(.+?)[ _,]+({'|'.join(_WORDS)})", re.IGNORECASE)
+_UNITS = (  # in brackets, but for `position[m]`, in which are joints; behind a slash; behind a word, or run together
+    re.compile(r"(?!(?:.*[./:])?(?:position|velocity|effort|data)\[)(.+?)[ _,]*[\[({]([^][(){}]+)[\])}]"),
+    re.compile(r"(.+?)(?:\s+/\s*|\s*/\s+|\s+in\s+)(.+)"),
+    re.compile(rf"(.+?)[ _,]+({'|'.join(_WORDS)})", re.IGNORECASE),
+    re.compile(r"(.*[a-z\d])(Deg|RPM|Rpm|Mm)"),
+)
 
 
 def named_unit(name: str, *, brackets: bool = False) -> tuple[str, str]:
-    """A name without the unit at its end, and that unit, or nothing; `brackets`: only in such.
-
-    In the brackets behind an array of joints are names: `position[m]`.
-    """
-    match = _UNIT.fullmatch(name)
-    if match is None or _parsed(match[2]) is None:
-        match = None if brackets else _WORD.fullmatch(name)
-    if match is None:
-        return name, ""
-    return match[1], match[2].lower() if match[2].lower() in UNITS else match[2]
+    """A name without the unit at its end, and that unit, or nothing; `brackets`: only in such, or behind a slash."""
+    for pattern in _UNITS[: 2 if brackets else None]:
+        if (match := pattern.fullmatch(name)) and _parsed(match[2]) is not None:
+            return match[1], match[2].lower() if match[2].lower() in UNITS else match[2]
+    return name, ""
 
 
 def si(unit: str) -> tuple[str, float]:
@@ -67,7 +65,8 @@ def factor(unit: str, other: str) -> float | None:
 @functools.cache
 def _parsed(unit: str) -> tuple[float, dict[str, int]] | None:
     """Size of a unit such as `mm/s^2` or `mN m`, and powers of the simple units in it; None where one is unknown."""
-    size, of = _SIZES.get(unit) or (_PREFIXES.get(unit[:1], 0.0) * _SIZES.get(unit[1:], (0.0, ""))[0], "")
+    prefixes = {"k": 1e3, "M": 1e6, "d": 0.1, "c": 1e-2, "m": 1e-3, "u": 1e-6, "µ": 1e-6, "μ": 1e-6, "n": 1e-9}
+    size, of = _SIZES.get(unit) or (prefixes.get(unit[:1], 0.0) * _SIZES.get(unit[1:], (0.0, ""))[0], "")
     if size:
         of = of or _SIZES[unit[1:]][1]
         inner = (1.0, {of: 1}) if _SIZES.get(of) == (1.0, of) else _parsed(of)

@@ -14,8 +14,6 @@ from .recording import SECOND, Lag, Track, refuse
 
 BACK = 1.0
 """Seconds that a log may be out of order: writers of several threads are, a clock that was set back is more."""
-DAY = 86400.0
-"""s."""
 RUNS = 4096
 """Stretches in which a clock does not step by more than `BACK`, above which wrong times are not looked for."""
 
@@ -89,9 +87,9 @@ def nanoseconds(
     """
     if not np.isfinite(t).all():
         refuse(path, where, "holds times that are no numbers", "cut the rows without a time")
-    steps = np.diff(t)
-    if unit in ("", "s") and (steps < 0).any() and t.min() >= 0 and t.max() < DAY:
-        t = t + (days() if days else DAY * np.append(0, np.cumsum(steps < -DAY / 2)))
+    steps, day = np.diff(t), 86400.0
+    if unit in ("", "s") and (steps < 0).any() and t.min() >= 0 and t.max() < day:
+        t = t + (days() if days else day * np.append(0, np.cumsum(steps < -day / 2)))
     # Seconds since 1970 in 2001 and 2099: numbers of this size are times of a clock in s, a thousandfold in ms
     since_1970 = (1.0e9, 4.1e9)
     low, high = since_1970
@@ -142,7 +140,7 @@ def trusted(t: Int[np.ndarray, " message"]) -> Int[np.ndarray, " kept"] | None:
     if weight.sum() - weight[chain].sum() > budget:
         return None
     # Silence [s] that no log has: what is beyond, if it is little, has stamps of a clock that was not set
-    groups = np.cumsum(np.append(0, low[chain][1:] - high[chain][:-1] > 30 * DAY * SECOND))
+    groups = np.cumsum(np.append(0, low[chain][1:] - high[chain][:-1] > 30 * 86400.0 * SECOND))
     size = np.bincount(groups, weight[chain])
     few = (size < 50) & (size <= budget)  # wrong times beyond a silence at most: as many rows as a sequence needs
     if few.any() and not few.all() and size[few].sum() <= budget:

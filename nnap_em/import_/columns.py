@@ -25,11 +25,13 @@ def resolve(
 
 
 def declared_at(path: Path, topics: Sequence[Topic], address: Address, column: str) -> Address:
-    """The address as the file has it, whose names may hold a colon."""
+    """The address as the file has it, whose names may hold a colon, and end in a unit that is not declared."""
     where = f"column {column!r} from {str(address)!r}"
     for topic in topics:
-        if (path_there := str(address).removeprefix(f"{topic.name}:" if topic.name else "")) in topic.fields:
-            return address._replace(topic=topic.name, path=path_there)
+        there = str(address).removeprefix(f"{topic.name}:" if topic.name else "")
+        alike = [field for field in topic.fields if there in (field, named_unit(field, brackets=True)[0])]
+        if there in topic.fields or len(alike) == 1:
+            return address._replace(topic=topic.name, path=there if there in topic.fields else alike[0])
     topic = next((topic for topic in topics if topic.name == address.topic), None)
     if topic is None:
         hint = near(address.topic, [topic.name for topic in topics])
@@ -44,7 +46,8 @@ def in_unit(path: Path, column: str, at: Address, rig: Rig) -> tuple[Address, st
     """
     named, unit = named_unit(at.path)[1], rig.column_unit(column)
     times = factor(named, unit) if named and at.scale is None else None
-    sure = at.path[-1] in "])" or (len(named) > 1 and named not in UNITS)  # x_s, tau_m: a letter may mean anything
+    single = len(named) < 2 or named in UNITS  # x_s, tau_m: a letter may mean anything
+    sure = not single or bool(named_unit(at.path, brackets=True)[1])
     if times is not None and math.isnan(times) and sure:
         hint = f'write [import.columns] {column} = {{ from = "{at}", scale = ... }} with {unit} per {named}'
         current = ', or [input] kind = "affine" with its gain' if column in rig.input_columns else ""

@@ -6,16 +6,13 @@ import numpy as np
 
 from .recording import Recording
 
-LATENCY = 0.25
-"""Longest latency of a recorder: stamps that are more behind the log times are of another clock [s]."""
-
 
 def on_one_clock(recording: Recording, dt: float, shifted: Collection[str]) -> Recording:
     """The recording with its topics on the clock of the log, where their clocks differ by what is no latency.
 
     A stamp is behind the log time of its message by the latency of the recorder: never ahead of it, by no more than
-    `LATENCY`, and by the same at the end as at the start, to a row each.  Within this, a difference of more than a row
-    is reported, save for topics in `shifted`.
+    0.25 s, and by the same at the end as at the start, to a row each.  Within this, a difference of more than a row is
+    reported, save for topics in `shifted`.
     """
     lags = {topic: np.array(track.lag, float).T for topic, track in recording.tracks.items() if track.lag}
     clocks = {track.clock for track in recording.tracks.values() if not track.lag}
@@ -36,7 +33,8 @@ def on_one_clock(recording: Recording, dt: float, shifted: Collection[str]) -> R
         if np.abs(each).max() > dt
     }
     stamps = f"header stamps of {', those of '.join(words.values())} the clock of the log"
-    if late.min() < -dt or late.max() > LATENCY or np.ptp(apart) > dt:
+    latency = 0.25  # longest one of a recorder [s]: stamps that are more behind the log times are of another clock
+    if late.min() < -dt or late.max() > latency or np.ptp(apart) > dt:
         tracks = dict(recording.tracks)
         for topic in words:
             t = tracks[topic].t

@@ -37,7 +37,10 @@ def _topic(group: Any) -> Topic:
         if axis is not None and data == axis:
             continue
         if axis is None or data.shape[0] == axis.shape[0]:
-            fields += [name] if data.ndim == 1 else [f"{name}[{i}]" for i in range(data.shape[1])]
+            names = [name] if data.ndim == 1 else [f"{name}[{i}]" for i in range(data.shape[1])]
+            unit = f" [{_unit(data)}]"
+            known = named_unit(f"{name}{unit}")[1] and not named_unit(name)[1]
+            fields += [f"{each}{unit}" if known else each for each in names]
             rows = data.shape[0]
     return Topic(group.name, f"group, time in {axis.name!r}" if axis is not None else "no time axis", rows,
                  tuple(fields))  # fmt: skip
@@ -55,6 +58,7 @@ def _track(path: Path, group: Any, paths: Sequence[str]) -> Track:
 
 def _column(group: Any, field: str) -> Float[np.ndarray, " row"]:
     """One column, read in blocks: neighbours of a wide data set are not kept."""
+    field = field if field in group else named_unit(field, brackets=True)[0]
     name, _, index = (field, "", "") if field in group else field.removesuffix("]").rpartition("[")
     data = group[name]
     if data.ndim == 1:
@@ -69,7 +73,7 @@ def _nanoseconds(path: Path, axis: Any) -> Int[np.ndarray, " row"]:
     t, where = axis[:], f"data set {axis.name!r}"
     if t.dtype.kind in "OS":
         t = dated(t)
-    unit = _text(axis.attrs.get("units", axis.attrs.get("unit", ""))).lower().partition(" since ")[0].strip()
+    unit = _unit(axis).lower().partition(" since ")[0].strip()
     return nanoseconds(path, where, t, unit if unit in UNITS else named_unit(axis.name.rpartition("/")[2])[1])
 
 
@@ -101,6 +105,11 @@ def _groups(group: Any) -> Iterator[Any]:
     for item in group.values():
         if hasattr(item, "items"):
             yield from _groups(item)
+
+
+def _unit(data: Any) -> str:
+    """The unit that an attribute of a data set names."""
+    return _text(data.attrs.get("units", data.attrs.get("unit", "")))
 
 
 def _text(value: Any) -> str:

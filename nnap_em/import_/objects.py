@@ -1,7 +1,7 @@
 """Numbers of decoded messages: dicts, lists and objects with fields, whoever decoded them."""
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 from .recording import steps
@@ -19,12 +19,7 @@ def flatten(message: Any) -> dict[str, float]:
 
 def pick(message: Any, path: str) -> float:
     """The number at a path; NaN where the message has none."""
-    at: Any = message
-    parent: Any = None
-    while isinstance(at, Mapping) and path not in at and isinstance(at.get(path.partition(".")[0]), Mapping):
-        head, _, path = path.partition(".")
-        at = at[head]
-    names = [path] if isinstance(at, Mapping) and path in at else steps(path)  # its own name may have brackets
+    (at, names), parent = _way(message, path), None
     try:
         for step in names:
             if isinstance(step, int):
@@ -36,6 +31,14 @@ def pick(message: Any, path: str) -> float:
         return math.nan if at is None or isinstance(at, str) else float(at)
     except (KeyError, IndexError, ValueError, AttributeError, TypeError):
         return math.nan
+
+
+def _way(message: Any, path: str) -> tuple[Any, Iterable[str | int]]:
+    """Start and steps of a path; a name with dots or brackets, as `Torque [Nm]`, is one step."""
+    while isinstance(message, Mapping) and path not in message and isinstance(message.get(path.split(".")[0]), Mapping):
+        head, _, path = path.partition(".")
+        message = message[head]
+    return message, [path] if isinstance(message, Mapping) and path in message else steps(path)
 
 
 def _numbers(at: Any, path: str) -> Iterator[tuple[str, float]]:

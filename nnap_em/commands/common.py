@@ -26,7 +26,6 @@ from ..em.loop import FitError
 from ..experiment.limits import DesignError
 from ..export.model import ExportError
 from ..fit.check import ERROR, torques
-from ..fit.identify import Identified
 from ..fit.known import differences
 from ..fit.predict import GIVEN
 from ..fit.store import AFTER_FILE, MODEL_FILE, Stored, fingerprint, model_file, read

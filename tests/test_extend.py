@@ -9,7 +9,7 @@ import rod
 
 from nnap_em.diagnosis.context import SEARCH_EFFORT, SearchContext, extend
 from nnap_em.diagnosis.hypothesis import Hypothesis
-from nnap_em.diagnosis.losses import OneStep
+from nnap_em.diagnosis.losses import MultiStep
 from nnap_em.em.loop import Schedule
 from nnap_em.fit.identify import friction_table, identify
 
@@ -24,7 +24,7 @@ def fitted(tmp_path_factory):
 def _extended(fitted, model):
     """A fit that goes on from `model`, and what it logs."""
     (before, data), lines = fitted, []
-    context = SearchContext(before, {}, data, OneStep(), SEARCH_EFFORT, lines.append)
+    context = SearchContext(before, {}, data, MultiStep(), SEARCH_EFFORT, lines.append)
     return extend(context, Hypothesis(model, before.m_step), rod.ROWS), lines
 
 

@@ -104,10 +104,10 @@ def test_a_law_names_its_headline_number_first():
     assert list(estimates(load, np.eye(4), system)) == ["mass", "centre_x", "centre_y", "centre_z"]
 
 
-def test_a_law_by_many_steps_has_shares_and_one_by_one_step_has_nats():
-    nats, shares = Evidence(100.0, 50.0, 1e-20), Evidence(share=0.4, chance=0.02, parts=(4, 5), removed=0.5)
+def test_a_law_by_many_steps_has_shares_and_one_that_was_read_off_has_nats():
+    nats, shares = Evidence(100.0), Evidence(share=0.4, chance=0.02, parts=(4, 5), removed=0.5)
     for found, known in (
-        (nats, {"log_likelihood_gain", "held_out_gain", "p_value"}),
+        (nats, {"log_likelihood_gain"}),
         (shares, {"share_of_error", "chance"}),
     ):
         diagnosis = _closed(ARM, _spring(2))

@@ -95,9 +95,12 @@ def test_errors_are_those_of_the_model_run_alone(known):
     x = known.path.mean[:, first]
     for k in range(first, first + grid.ages[0]):
         x = jax.vmap(heavy.transition)(x, jax.tree.map(lambda a, k=k: a[:, k], inputs))
-    difference = known.path.mean[:, first + grid.ages[0], :2] - x[:, :2]
+    difference = known.path.mean[:, first + grid.ages[0]] - x
     # the filter is at the first start to the noise of its readings
-    np.testing.assert_allclose(error[:, 0, 0], difference, atol=0.05 * float(jnp.abs(difference).max()))
+    every = errors(followed(heavy, prior, known.path, known.data), see=(0, 1, 2, 3))
+    np.testing.assert_allclose(error[:, 0, 0], difference[:, :2], atol=0.05 * float(jnp.abs(difference[:, :2]).max()))
+    np.testing.assert_allclose(every[:, 0, 0], difference, atol=0.05 * float(jnp.abs(difference).max()))
+    np.testing.assert_array_equal(every[..., :2], error)
 
 
 def test_all_horizons_share_one_program_and_its_errors(known, monkeypatch):
@@ -112,7 +115,9 @@ def test_all_horizons_share_one_program_and_its_errors(known, monkeypatch):
     np.testing.assert_array_equal(short[:, : both.shape[1]], both[:, :, :2])
 
 
-@pytest.mark.parametrize("name", ["torsional_spring", "base_tilt", "motor_gain"])
+@pytest.mark.parametrize(
+    "name", ["torsional_spring", "payload", "base_tilt", "motor_gain", "eddy_brake", "sensor_bias", "sensor_scale"]
+)
 def test_columns_are_difference_quotients(question, known, name):
     """A column is minus the change of the error where a hundredth of the effect is in the model."""
     candidates = _candidates(question, name)

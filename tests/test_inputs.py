@@ -1,5 +1,6 @@
 """Signals of a law: every input is its own, any number of joints, and the free form of a law is of the same ones."""
 
+from types import SimpleNamespace
 from typing import ClassVar
 
 import equinox as eqx
@@ -12,11 +13,11 @@ import pytest
 from nnap_em.data.dataset import Dataset
 from nnap_em.data.rig import Declared, Rig
 from nnap_em.diagnosis.hypothesis import Hypothesis
-from nnap_em.diagnosis.losses import OneStep
+from nnap_em.diagnosis.losses import MultiStep
 from nnap_em.diagnosis.propose import proposals, surroundings
 from nnap_em.diagnosis.screen import screen
 from nnap_em.diagnosis.smoothed import SmoothedFit
-from nnap_em.effects import OperatingPoint, SearchScales, catalogue, free_form
+from nnap_em.effects import Candidate, OperatingPoint, SearchScales, catalogue, free_form
 from nnap_em.effects.function import Axis, UnknownFunction
 from nnap_em.em.build import build
 from nnap_em.model.state_space import Inputs, with_effects
@@ -70,13 +71,21 @@ def _screened(asked, candidates):
     model, rule, data, path, _ = asked
     data = jax.tree.map(jnp.asarray, data)
     bare = Hypothesis(model, rule)
-    return screen(OneStep(), SmoothedFit(bare, bare, path, data, np.ones(COUNT, bool), ROWS), candidates).screened
+    return screen(MultiStep(), SmoothedFit(bare, bare, path, data, np.ones(COUNT, bool), ROWS), candidates).screened
 
 
 def _functions(around):
     """Of one signal each."""
     every = catalogue["unknown_function"].candidates(around)
     return [c for c in every if isinstance(c.start, UnknownFunction) and len(c.start.axes) == 1]
+
+
+def test_a_law_of_no_size_is_no_candidate(plain):
+    """A centre of mass on the axis cannot be off by a share of it: the column would be zero, and the prior."""
+    law = lambda size: catalogue["center_of_mass"](jnp.asarray(size), joint=1)  # noqa: E731
+    every = [Candidate(law(0.0), (law(size),), law(size)) for size in (0.1, 0.0)]
+    kind = SimpleNamespace(candidates=lambda around: every)
+    assert proposals(plain[-1], kinds=(kind,)) == every[:1]
 
 
 def test_functions_of_every_input_are_tried_at_its_joint_by_its_column(plain):

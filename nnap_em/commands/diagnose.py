@@ -50,7 +50,7 @@ def run(args: argparse.Namespace, log: Log) -> None:
         began_from = {"start": start and start.fitted, "own": own}
         seconds -= spent
         diagnosis = diagnose(bench.rig, bench.train.data, key=key, log=report, seconds=seconds, **began_from)
-        journal.open = not diagnosis.complete
+        journal.open = not diagnosis.complete and not diagnosis.failure  # the same steps would fail again
         accepted, mark = findings(diagnosis), fingerprint(bench.train.data)
         remove_reports(args.out)
         notes = {"settings": {"seed": args.seed}, "logs": logs_at(args)}

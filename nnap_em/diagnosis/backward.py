@@ -6,18 +6,18 @@ from typing import NamedTuple, cast
 
 import numpy as np
 
+from ..em.multistep import channels
 from ..numerics.digits import share_of
 from .context import SearchContext, smooth
 from .hypothesis import Evidence, Hypothesis
 from .keys import Key, elsewhere, key_of, remainder_of, words
-from .losses import readings
 from .propose import proposals, surroundings
 from .refit import Refit
 from .rounds import best_of_kind
 from .screen import screen
 from .smoothed import SmoothedFit
 from .trial import Null, Trial, null_of, with_candidate
-from .verdict import KEEP, Rejection, needed
+from .verdict import KEEP, MULTI_STEP, Rejection, needed
 
 
 class _Reduced(NamedTuple):
@@ -42,10 +42,10 @@ def backward(context: SearchContext, hypothesis: Hypothesis) -> Hypothesis:
         full = null_of(hypothesis, fit, context.loss, context.effort.passes).end
         reduced = [_without(context, fit, full, place) for place in range(len(hypothesis.evidence))]
         least = int(np.argmin([one.lost for one in reduced]))
-        lost, floor = reduced[least].lost, context.loss.bars.floor(float(readings(fit.data, fit.used)))
-        if needed(lost, floor):
+        lost = reduced[least].lost
+        if needed(lost, MULTI_STEP):
             return _compared(context, hypothesis, full, reduced)
-        reason = f"without it {share_of(lost, 'the squared error', 1)} is lost, {KEEP * floor:.1%} counts"
+        reason = f"without it {share_of(lost, 'the squared error', 1)} is lost, {KEEP * MULTI_STEP:.1%} counts"
         reason = reason if lost > -math.inf else Rejection("impossible").sentence
         context.log(f"  {words(key_of(hypothesis.model.effects[least]))} is removed: {reason}")
         hypothesis = hypothesis.without(least)
@@ -53,7 +53,10 @@ def backward(context: SearchContext, hypothesis: Hypothesis) -> Hypothesis:
 
 
 def _without(context: SearchContext, fit: SmoothedFit, full: Refit, place: int) -> _Reduced:
-    """The fit without the effect at `place`, and the share of its squared error that the effect removes at best."""
+    """The fit without the effect at `place`, and the share of its squared error that the effect removes at best.
+
+    A law of a rate, which is not compared, is judged by the errors of that reading, too.
+    """
     hypothesis, effects = fit.hypothesis, fit.model.effects
     if (
         hypothesis.evidence[place] is None
@@ -68,8 +71,12 @@ def _without(context: SearchContext, fit: SmoothedFit, full: Refit, place: int) 
     if not both.used.any():  # without it no sequence is followed
         return _Reduced(math.inf)
     null = null_of(both.hypothesis, both, context.loss, context.effort.passes)
-    bands = range(len(context.loss.bands))
-    return _Reduced(max(1 - context.loss.ratio(null.end, full, both, band) for band in bands), both, null)
+    judged = [(band, ()) for band in range(len(context.loss.bands))]
+    measured, channel = context.before.rig.measured, key_of(effects[place])[2]
+    if channel in measured and (own := measured.index(channel)) not in channels(fit.model):
+        # Noise that is fitted without its law makes a rate count for nothing: of others the law then removes nothing
+        judged.append((0, (own,)))
+    return _Reduced(max(1 - context.loss.ratio(null.end, full, both, *one) for one in judged), both, null)
 
 
 def _compared(context: SearchContext, hypothesis: Hypothesis, full: Refit, reduced: Sequence[_Reduced]) -> Hypothesis:

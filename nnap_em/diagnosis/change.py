@@ -14,7 +14,7 @@ def changes(diagnosis: Diagnosis, accepted: Sequence[Finding], error: Mapping[st
     """The outcome in one sentence, where nothing is named with the test of whether errors have risen."""
     if not diagnosis.complete:
         first = changes(diagnosis._replace(complete=True), accepted, error)
-        return f"{first} The search is not finished: more may have changed."
+        return f"{first} {diagnosis.unfinished}: more may have changed."
     if accepted:
         return verdict(accepted, error, opening="Changed since the fit:")
     test, rivals = diagnosis.risen, listed([*map(words, undecided(diagnosis))])

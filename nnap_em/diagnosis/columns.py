@@ -147,18 +147,18 @@ def blocks_of(candidates: Sequence[Candidate]) -> Blocks:
     return [[one for _, one in same] for _, same in itertools.groupby(numbered, lambda pair: pair[0])]
 
 
-def columns_by_block(base: StateSpaceModel, blocks: Blocks, rows: int = 0) -> Iterator[Callable[[Track], Columns]]:
+def columns_by_block(base: StateSpaceModel, blocks: Blocks) -> Iterator[Callable[[Track], Columns]]:
     """`candidate_columns` of each block, all of one size: columns of nothing fill the others up."""
     size = max(sum(len(candidate.probes) for candidate in block) for block in blocks)
-    return (candidate_columns(base, block, rows, size) for block in blocks)
+    return (candidate_columns(base, block, size) for block in blocks)
 
 
 def candidate_columns(
-    base: StateSpaceModel, candidates: Sequence[Candidate], rows: int = 0, size: int = 0
+    base: StateSpaceModel, candidates: Sequence[Candidate], size: int = 0
 ) -> Callable[[Track], Columns]:
     """Columns that the probes of all candidates add to `base` along the tracks of some sequences: seq column time ...
 
-    Tracks are padded to `rows`, so that horizons share the largest program, and columns of 0 behind them to `size`.
+    They are padded by columns of 0 to `size`.
     """
     stacks = _stacks([probe for candidate in candidates for probe in candidate.probes])
     groups = [list(same) for _, same in itertools.groupby(stacks, lambda stack: type(stack.probes))]
@@ -166,16 +166,13 @@ def candidate_columns(
 
     def along(track: Track) -> Columns:
         length = track.middle.shape[1]
-        padding = [(0, 0), (0, max(0, rows - length))]
-        longer = lambda a: np.pad(a, padding + [(0, 0)] * (a.ndim - 2), mode="edge")  # noqa: E731
-        track = jax.tree.map(longer, track)
         last = track.acceleration.shape[-1], len(base.measured)
         force, reading = (np.zeros((len(track.middle), size, length, n), track.middle.dtype) for n in last)
         for group in groups:  # a program for every class
             every = each(_stack_columns, (base, [(stack.probes, stack.axes) for stack in group]), track)
             for stack, columns in zip(group, every, strict=True):
                 for full, values in ((force, columns.force), (reading, columns.reading)):
-                    full[:, stack.places] = np.asarray(values)[:, : len(stack.places), :length]
+                    full[:, stack.places] = np.asarray(values)[:, : len(stack.places)]
         return Columns(force, reading)
 
     return along

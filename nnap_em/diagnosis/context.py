@@ -23,7 +23,7 @@ from ..model.state_space import StateSpaceModel
 from ..numerics.digits import counted
 from ..storage.log import Log
 from .hypothesis import Hypothesis
-from .losses import AbstractLoss
+from .losses import MultiStep
 from .smoothed import SmoothedFit
 from .verdict import DETERMINED
 
@@ -60,7 +60,7 @@ class SearchContext(NamedTuple):
     before: Identified
     stages: Stages
     data: Dataset
-    loss: AbstractLoss
+    loss: MultiStep
     effort: Effort
     log: Log
     pieces: tuple[int, ...] = ()
@@ -72,7 +72,7 @@ class SearchContext(NamedTuple):
     change: bool = False
     """True where that is the question: the declared model is a fit, and its laws stay."""
     white: bool = False
-    """True where readings carry white noise: one-step errors then count, last and among laws that predict alike."""
+    """True where readings carry white noise: what likelihood states then holds, and short horizons of hidden joints."""
     risen: Risen | None = None
     """Test of whether errors have risen since that fit; None where its recordings are not at hand."""
     kinds: Collection[type[AbstractEffect]] = catalogue.values()
@@ -196,12 +196,9 @@ def _afresh(context: SearchContext, hypothesis: Hypothesis) -> Callable[[], EMSt
 
 
 def _best(context: SearchContext, hypothesis: Hypothesis, fits: Sequence[EMState]) -> EMState:
-    """The likeliest of some fits; where many steps decide the one that predicts best, or if that is better the
-    hypothesis as it stands: EM, by one-step likelihood, may leave what the errors of many steps had taught.
+    """The fit that predicts best, or if that is better the hypothesis as it stands: EM, by one-step likelihood, may
+    leave what the errors of many steps had taught.
     """
-    state = functools.reduce(lambda a, b: b if ahead(b.top, a.top) > 0 else a, fits)
-    if not context.loss.multi_step:
-        return state
     (own, used), *others = (
         smooth(context, hypothesis.refitted(model), context.longest)
         for model in (hypothesis.model, *(cast(StateSpaceModel, one.best) for one in fits))
@@ -215,7 +212,7 @@ def _best(context: SearchContext, hypothesis: Hypothesis, fits: Sequence[EMState
     if min(left) <= 1:
         near = [one for one, share in zip(fits, left, strict=True) if share <= min(left) + LEAST_FALL]
         return functools.reduce(lambda a, b: b if ahead(b.top, a.top) > 0 else a, near)
-    begun = later_state(hypothesis.model, hypothesis.m_step, key=state.key)
+    begun = later_state(hypothesis.model, hypothesis.m_step, key=fits[0].key)
     schedule = Schedule(first=context.longest)
     return fit(begun, context.data, context.before.smoother, hypothesis.m_step, epochs=2, schedule=schedule)
 

@@ -225,7 +225,7 @@ def search_equations(before: Identified, data: Dataset, log: Log, until: float =
         if chosen is None:
             break
         for law, effect in zip(chosen.laws, chosen.effects, strict=True):
-            record = Evidence(math.nan, math.nan, math.nan, alike, chosen.share, chosen.share)
+            record = Evidence(equivalent=alike, share=chosen.share, chance=chosen.share)
             hypothesis = hypothesis.plus(effect, law, record)
             log(f"  added {words(key_of(effect))}")
         hypothesis = hypothesis.refitted(_with_numbers(hypothesis, chosen))
@@ -266,13 +266,13 @@ def _round(
     log, rows = search.log, search.data.t.shape[1]
     whole, room = search.loss(null.of), search.room(null.of)
     log(f"{len(fresh)} candidates; {max(room, 0.0):.0%} of the squared error is not noise of the readings")
-    if room < MULTI_STEP.share:
+    if room < MULTI_STEP:
         return None, (), Step(rows, (), (), None, 0, MEASURE)
     singles = search.screened(lean, fresh)
     short = [case for n in range(1, 4) for case in [c for c in singles if c.numbers == n and _sound(c)][:SHORTLIST]]
     judged = search.judged(lean, short, base)
     passing, tried = [case for case in judged if _passes(case)], [*judged]
-    most = max([MULTI_STEP.share, *(case.share for case in passing)]) / PAIR
+    most = max([MULTI_STEP, *(case.share for case in passing)]) / PAIR
     if room > most and time.monotonic() < search.until:  # else no pair and no function could be chosen
         both = itertools.combinations(singles[:PARTNERS], 2)
         joined = [((*a.laws, *b.laws), (*a.effects, *b.effects)) for a, b in both]
@@ -303,7 +303,7 @@ def _sound(case: Case) -> bool:
 def _passes(case: Case) -> bool:
     """True where the parts left out confirm that the laws remove a share of the squared error."""
     agree = sum(gain > 0 for gain in case.folds) >= AGREE * len(case.folds)
-    return case.share * case.odds >= MULTI_STEP.share and agree and _sound(case) and _certain(case)
+    return case.share * case.odds >= MULTI_STEP and agree and _sound(case) and _certain(case)
 
 
 def _certain(case: Case) -> bool:

@@ -104,8 +104,8 @@ def findings(diagnosis: Diagnosis) -> list[Finding]:
             sentence += f"; the law is not quite of this form, what is left has {left}"
         evidence = {
             "log_likelihood_gain": record.gain,
-            "p_value": max(1e-300, record.p_value) if finite(record.p_value) else math.nan,
-            "held_out_gain": record.held_out,
+            "p_value": math.nan,  # of a search by likelihood, as the next: files keep their keys
+            "held_out_gain": math.nan,
             "share_of_error": record.share,
             "chance": record.chance,
             "parts": list(record.parts),
@@ -123,22 +123,22 @@ def verdict(
     failed: int = 0,
     rivals: Sequence[Key] = (),
     suspects: Sequence["SuspectReport"] = (),
-    complete: bool = True,
+    unfinished: str = "",
     opening: str = "The model lacks",
 ) -> str:
     """The outcome in one sentence; `failed` tests of the one-step errors of the declared model failed clearly,
-    `rivals` explain the same of what is left, and `suspects` remove more than chance.  A second one where the search is
-    not `complete`. `opening` begins the sentence that names laws.
+    `rivals` explain the same of what is left, and `suspects` remove more than chance.  A second one has the reason
+    for which the search is `unfinished`. `opening` begins the sentence that names laws.
 
     It names the column whose test error falls most, and trusts a finding where the geometric mean over all falls.
     """
-    if not complete:
+    if unfinished:
         first = (
             verdict(accepted, error, failed, rivals, suspects)
             if accepted or rivals or suspects
             else "No effect was found yet."
         )
-        return f"{first} The search was not finished in the time given: more may be missing."
+        return f"{first} {unfinished}: more may be missing."
     if not accepted and rivals:
         return (
             f"Something is missing, but these recordings cannot tell what: {listed([*map(words, rivals)])} explain the "

@@ -20,16 +20,12 @@ class Evidence(NamedTuple):
     """Evidence for an added effect."""
 
     gain: float = math.nan
-    """Log-likelihood over the model without it, where it was found [nat]; NaN where many steps decided, as the next."""
-    held_out: float = math.nan
-    """Expected gain on parts left out of the fit of its strengths [nat]."""
-    p_value: float = math.nan
-    """P-value of the likelihood ratio, times the number of candidates tried."""
+    """Log-likelihood over the model without it [nat], of a law that was read off; NaN of others."""
     equivalent: tuple[Key, ...] = ()
     """Effects that the data cannot distinguish from it."""
     share: float = math.nan
-    """Share of the multi-step error that it removes on recordings left out of its fit; NaN where one step decided, as
-    the next."""
+    """Share of the multi-step error that it removes on recordings left out of its fit; NaN of a law that was read
+    off, as the next."""
     chance: float = math.nan
     """Largest such share of any law whose columns are shifted in time."""
     parts: tuple[int, ...] = ()

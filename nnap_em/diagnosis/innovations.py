@@ -10,13 +10,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from ..data.dataset import Dataset
-from ..fit.identify import Identified
-from .residual import Names, Residual, residual
+from .residual import Names, Residual
 from .statistics import FAILS, LAGS, bias, dependence, holm, normality, spread, whiteness
-
-WHITE = 0.25
-"""Largest autocorrelation at which innovations count as white; 0.4 to 0.5 on real machines."""
 
 
 class Test(NamedTuple):
@@ -34,14 +29,6 @@ class Test(NamedTuple):
     """The result in one sentence."""
     slight: bool
     """True where it failed by a size too small to matter."""
-
-
-def white_innovations(fitted: Identified, data: Dataset) -> bool:
-    """True if the innovations of every reading are white: no autocorrelation reaches `WHITE`."""
-    left = residual(fitted, data)
-    e = left.innovation[left.used]
-    sizes = [whiteness(e[..., i])[2] for i in range(e.shape[-1]) if np.isfinite(e[..., i]).sum() > 100]
-    return bool(sizes) and max(map(abs, sizes)) < WHITE
 
 
 def causes(residual: Residual, names: Names) -> Iterator[tuple[str, Float[np.ndarray, "seq time"]]]:

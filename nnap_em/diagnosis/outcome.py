@@ -50,7 +50,7 @@ class Step(NamedTuple):
     suspects: tuple[Suspect, ...] = ()
     """Best first; empty where a law was accepted."""
     untried: int = 0
-    """Candidates over their bar that were not refitted before the time was up."""
+    """Candidates over their bar that were not tried before the time was up or the shortlist was full."""
 
 
 class Diagnosis(NamedTuple):
@@ -65,7 +65,9 @@ class Diagnosis(NamedTuple):
     pieces: tuple[int, ...] = ()
     """Recording that every sequence of the fits is a piece of; empty if each is a recording."""
     complete: bool = True
-    """False where the time was up before the search had ended: more may be missing."""
+    """False where the search was stopped before its end: more may be missing."""
+    failure: str = ""
+    """Numerical failure that stopped it; empty where the time was up."""
     change: bool = False
     """True where the question was what changed since a fit, whose laws are in both models."""
     risen: Risen | None = None
@@ -79,6 +81,14 @@ class Diagnosis(NamedTuple):
         return text + ("" if self.complete else "; the search is not complete")
 
     @property
+    def unfinished(self) -> str:
+        """The reason for which the search was stopped, as the beginning of a sentence; empty where it was not."""
+        if self.complete:
+            return ""
+        failed = f"The search was stopped by a numerical failure ({self.failure})"
+        return failed if self.failure else "The search was not finished in the time given"
+
+    @property
     def last(self) -> tuple[Step, ...]:
-        """Last round of every measure: one-step errors do not withdraw what the multi-step errors left open."""
-        return tuple({step.measure: step for step in self.steps}.values())
+        """The last round, if there was one."""
+        return self.steps[-1:]

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from ..data.dataset import Dataset
 from ..data.rig import Rig
-from ..effects import AbstractEffect, Candidate, SearchScales, catalogue, free_form
+from ..effects import AbstractEffect, Candidate, SearchScales, catalogue, flat, free_form
 from ..em.build import measure_scales
 from ..model.state_space import StateSpaceModel, with_effects
 from ..numerics.gaussian import Gaussian
@@ -80,8 +80,11 @@ def proposals(
     known: Sequence[AbstractEffect] = (),
     kinds: Collection[type[AbstractEffect]] = catalogue.values(),
 ) -> list[Candidate]:
-    """Everything of some kinds that this machine could have, and other forms of what is `known` to be there."""
-    every = [candidate for kind in kinds for candidate in kind.candidates(around)]
+    """Everything of some kinds that this machine could have, and other forms of what is `known` to be there.
+
+    A law of no size is left out, such as another centre of mass as a share of one that is declared on the axis.
+    """
+    every = [candidate for kind in kinds for candidate in kind.candidates(around) if np.all(flat(candidate.prior_std))]
     keys = {key_of(candidate.start) for candidate in every}
     free = (form for law in known if law.named for form in free_form(law, around))
     every += [form for form in free if key_of(form.start) not in keys]

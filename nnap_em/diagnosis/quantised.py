@@ -13,7 +13,7 @@ from ..em.loop import EMState
 from ..model.state_space import StateSpaceModel
 from .context import SearchContext, extend
 from .hypothesis import Evidence, Hypothesis
-from .verdict import COARSE, FINEST, ONE_STEP
+from .verdict import COARSE, FINEST
 
 
 def quantised(context: SearchContext, hypothesis: Hypothesis) -> tuple[Hypothesis, EMState | None]:
@@ -22,6 +22,7 @@ def quantised(context: SearchContext, hypothesis: Hypothesis) -> tuple[Hypothesi
     A fit that took the steps for motion has lost its way: it begins again where it was short.
     """
     rig, state, first = context.before.rig, None, min(context.stages)
+    certain = 12.0  # gain in log-likelihood [nat] below which steps are no effect: chance exceeds it once in 10^6
     for i, channel in enumerate(rig.measured):
         y = np.asarray(context.data.y)[..., i]
         step = grid_step(y.ravel())
@@ -29,13 +30,13 @@ def quantised(context: SearchContext, hypothesis: Hypothesis) -> tuple[Hypothesi
         declared, estimated = rig.noise_std.get(channel), float(jnp.exp(model.log_r[i]))
         share = step**2 / 12 / (declared**2 if declared else max(estimated - step**2 / 12, FINEST * estimated))
         gain = 0.5 * np.isfinite(y).sum() * (share - math.log1p(share))  # of the right variance over that without it
-        if share < COARSE or gain < ONE_STEP.nats:
+        if share < COARSE or gain < certain:
             continue
         context.log(f"  {channel} comes in steps of {step:.4g}")
         effect = SensorQuantization(step=jnp.asarray(step), channel=channel)
         spread = SensorQuantization(step=jnp.asarray(1e-3 * step), channel=channel)
         candidate = Candidate(effect, (effect,), spread)
-        evidence = Evidence(float(gain), math.nan, math.nan)  # of the same numbers: nothing is left out
+        evidence = Evidence(float(gain))
         early = cast(StateSpaceModel, state.best if state else context.stages[first][0].best)
         hypothesis = hypothesis.refitted(early).plus(effect, candidate, evidence)
         if declared:

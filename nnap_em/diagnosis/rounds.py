@@ -6,7 +6,7 @@ from typing import NamedTuple, TypeVar, cast
 import jax
 import numpy as np
 
-from ..effects import AbstractEffect, flat
+from ..effects import AbstractEffect
 from ..model.state_space import StateSpaceModel
 from ..numerics.digits import share_of
 from ..storage.deadline import TimeUp
@@ -18,7 +18,7 @@ from .propose import proposals, seeded, surroundings
 from .screen import Screen, Screened, overlaps, screen
 from .smoothed import SmoothedFit
 from .trial import Null, Trial, explained, null_of, with_candidate
-from .verdict import EQUIVALENT, EQUIVALENT_NATS, NAMED, PRICE, SAME, agreed, even, odds, required, simplest, suspected
+from .verdict import EQUIVALENT, NAMED, SAME, agreed, even, odds, required, simplest, suspected
 
 _Law = TypeVar("_Law", Screened, Trial)
 
@@ -31,6 +31,8 @@ class Round(NamedTuple):
     accepted: Trial | None
     equivalent: tuple[Key, ...] = ()
     """Named laws that the data cannot distinguish from the accepted one."""
+    complete: bool = True
+    """False where the time was up before all was refitted."""
 
 
 def screening_round(fit: SmoothedFit, context: SearchContext) -> Round:
@@ -42,18 +44,18 @@ def screening_round(fit: SmoothedFit, context: SearchContext) -> Round:
     ranked = best_of_kind(s for s in fresh if seeded(s.candidate, s.coefficients).is_physical())
     length = int(np.max(np.sum(np.asarray(fit.data.valid), axis=1)))
     listed = tuple((key_of(s.candidate.start), _listed(s)) for s in ranked)
-    disputed = _disputed(fresh, seen) if context.loss.multi_step else ()
-    step = Step(length, listed, (), None, len(seen.screened), context.loss.measure, disputed)
+    step = Step(length, listed, (), None, len(seen.screened), context.loss.measure, _disputed(fresh, seen))
     admitted = [s for s in ranked if s.reached]
     tried: list[Trial] = []
+    complete = True
     fitting = fit, context.loss, context.effort.passes
     try:
         null = null_of(fit.hypothesis, *fitting) if admitted else None
-        while admitted and len(tried) < context.effort.shortlist:
-            group = _group(admitted, model)[: context.effort.shortlist - len(tried)]
-            cases = []
+        while admitted and (left := context.effort.shortlist - len(_removals(tried))) > 0:
+            group = _group(admitted, model)[:left]
+            cases: list[Trial] = []
             for s in group:
-                case = with_candidate(_forms(s, fresh, context), cast(Null, null), *fitting)
+                case = with_candidate(_forms(s, fresh), cast(Null, null), *fitting)
                 cases.append(case if case.rejection else case._replace(before=explained(case, context)))
                 _log(cases[-1], context)
             tried += cases
@@ -62,11 +64,11 @@ def screening_round(fit: SmoothedFit, context: SearchContext) -> Round:
                 return _accepted(admissible, Round(step._replace(refitted=_removals(tried)), seen, None), fit, context)
             admitted = [s for s in admitted if not any(s is other for other in group)]
     except TimeUp:
-        step = step._replace(untried=len(admitted))
+        complete = False
     judged = {key_of(case.candidate.start) for case in tried}
     others = [s for s in ranked if key_of(s.candidate.start) not in judged]
-    suspects = _suspects(others) if context.loss.multi_step else ()
-    return Round(step._replace(refitted=_removals(tried), suspects=suspects), seen, None)
+    step = step._replace(refitted=_removals(tried), suspects=_suspects(others), untried=len(admitted))
+    return Round(step, seen, None, complete=complete)
 
 
 def _group(admitted: Sequence[Screened], model: StateSpaceModel) -> list[Screened]:
@@ -80,27 +82,25 @@ def _group(admitted: Sequence[Screened], model: StateSpaceModel) -> list[Screene
     worths = _worths(band, values, model)
     group: list[Screened] = []
     for i in sorted(even(worths), key=lambda i: -worths[i]):
-        form = _form(band[i], band, values, values, model)
+        form = _form(band[i], band, values, model)
         group += [form, band[i]] if complexity(form.candidate.start) > complexity(band[i].candidate.start) else [form]
     group += [s for law in group for s in admitted if elsewhere(key_of(s.candidate.start), key_of(law.candidate.start))]
     return list({id(s): s for s in group}.values())
 
 
 def _accepted(admissible: list[Trial], outcome: Round, fit: SmoothedFit, context: SearchContext) -> Round:
-    """Choose among refitted laws: the simplest at the place that is worth most, in its simplest form; among those by
-    likelihood where readings are white.
+    """Choose among refitted laws: the simplest at the place that is worth most, in its simplest form.
 
     None where one that is worth as much is of another cause, nor a free function where no error rose since a fit.
     """
     model, values = fit.model, [case.removed for case in admissible]
-    ties = [_priced(case) for case in admissible] if context.white or not context.loss.multi_step else values
     worths = _worths(admissible, values, model)
-    leader = admissible[simplest(worths, _complexities(admissible, model), ties)]
-    best = _form(leader, admissible, values, ties, model)
+    leader = admissible[simplest(worths, _complexities(admissible, model), values)]
+    best = _form(leader, admissible, values, model)
     law = best.candidate.start
     tied = [case for case in (admissible[i] for i in even(worths)) if case is not leader]
     rivals = [case for case in tied if other_cause(case.effect, law, model.system)]
-    if rivals and context.loss.multi_step:
+    if rivals:
         keys = tuple(key_of(case.effect) for case in (best, *rivals))
         context.log(f"  cannot tell: {', '.join(map(words, keys))} explain the same; none is added")
         return outcome._replace(step=outcome.step._replace(rivals=keys))
@@ -110,17 +110,9 @@ def _accepted(admissible: list[Trial], outcome: Round, fit: SmoothedFit, context
     candidates = [s.candidate.start for s in outcome.screen.screened]
     parts = list(zip(candidates, overlaps(outcome.screen, best.screened), strict=True))
     same = [key_of(c) for c, part in parts if c.named and part < SAME]
-    if not context.loss.multi_step:
-        tied = [case for case in tied if _priced(best) - _priced(case) < EQUIVALENT_NATS]
-        same += [key_of(c) for c, part in parts if c.named and 0.0 < part * best.gain < EQUIVALENT_NATS]
     same += [key_of(case.effect) for case in tied if case.effect.named]
     equivalent = tuple(key for key in dict.fromkeys(same) if key != key_of(law))
     return Round(outcome.step._replace(accepted=key_of(best.effect)), outcome.screen, best, equivalent)
-
-
-def _priced(case: Trial) -> float:
-    """Gain in log-likelihood less the price of the law's numbers [nat]."""
-    return case.gain - PRICE * flat(case.effect).size
 
 
 def _complexities(laws: Sequence[_Law], model: StateSpaceModel) -> list[int]:
@@ -132,9 +124,7 @@ def _worths(laws: Sequence[_Law], values: Sequence[float], model: StateSpaceMode
     return [value * odds(number) for value, number in zip(values, _complexities(laws, model), strict=True)]
 
 
-def _form(
-    law: _Law, laws: Sequence[_Law], values: Sequence[float], ties: Sequence[float], model: StateSpaceModel
-) -> _Law:
+def _form(law: _Law, laws: Sequence[_Law], values: Sequence[float], model: StateSpaceModel) -> _Law:
     """Simplest among a law, the free functions that contain it and what it contains, that explains as much as the best.
 
     The parts left out of all are the same, so that they differ by what they explain: a bump is no ripple.
@@ -143,8 +133,8 @@ def _form(
     one_cause = lambda other: contains(other, own, model.system) or contains(own, other, model.system)  # noqa: E731
     places = [i for i, other in enumerate(laws) if other is law or one_cause(other.candidate.start)]
     some = [laws[i] for i in places]
-    chosen = simplest([values[i] for i in places], _complexities(some, model), [ties[i] for i in places])
-    return some[chosen]
+    explained = [values[i] for i in places]
+    return some[simplest(explained, _complexities(some, model), explained)]
 
 
 def other_cause(one: AbstractEffect, best: AbstractEffect, system: AbstractSystem) -> bool:
@@ -180,11 +170,11 @@ def best_of_kind(every: Iterable[Screened]) -> list[Screened]:
     return sorted(best.values(), key=_listed, reverse=True)
 
 
-def _forms(law: Screened, every: Sequence[Screened], context: SearchContext) -> list[Screened]:
-    """A law and, where many steps decide, its other starts that explain as much; parts may contradict those."""
+def _forms(law: Screened, every: Sequence[Screened]) -> list[Screened]:
+    """A law and its other starts that explain as much; parts may contradict those."""
     shape = jax.tree.structure(law.candidate.start)
     same = [s for s in every if s.band == law.band and jax.tree.structure(s.candidate.start) == shape]
-    near = [s for s in same if s.share.least >= EQUIVALENT * law.share.least] if context.loss.multi_step else [law]
+    near = [s for s in same if s.share.least >= EQUIVALENT * law.share.least]
     return [s for s in near if s is law or (s.sound and seeded(s.candidate, s.coefficients).is_physical())]
 
 
@@ -197,9 +187,8 @@ def _log(case: Trial, context: SearchContext) -> None:
     if case.refit is None:
         context.log(f"  {name} {values}: {share_of(share, error, 1)} by the linear screen, {step}; {bar}; not refitted")
         return
-    nats = f", {case.gain:.0f} nat" if np.isnan(case.foreseen) else f", {step}"
     context.log(
-        f"  refitted {name} {values}: {share_of(share, error, 1)} by the linear screen{nats}, "
+        f"  refitted {name} {values}: {share_of(share, error, 1)} by the linear screen, {step}, "
         f"{share_of(case.removed, error, 1)} after it; {bar}"
     )
     if reason is not None:
@@ -207,7 +196,9 @@ def _log(case: Trial, context: SearchContext) -> None:
 
 
 def _removals(tried: Sequence[Trial]) -> tuple[tuple[Key, float], ...]:
-    return tuple(sorted(((key_of(case.effect), case.removed) for case in tried), key=lambda entry: -entry[1]))
+    """Shares that laws remove after their refit, the best first."""
+    shares = ((key_of(case.effect), case.removed) for case in tried if case.refit is not None)
+    return tuple(sorted(shares, key=lambda entry: -entry[1]))
 
 
 def _suspects(ranked: Sequence[Screened]) -> tuple[Suspect, ...]:

@@ -20,9 +20,9 @@ from ..storage.journal import HERE, step
 from .columns import blocks_of
 from .folds import members, parts
 from .keys import complexity
-from .losses import AbstractLoss, Linearised
+from .losses import Linearised, MultiStep
 from .smoothed import SmoothedFit
-from .verdict import CHANCE, Share, agreed, required, sensible
+from .verdict import CHANCE, MULTI_STEP, Share, agreed, required, sensible
 
 SHIFTS = 2
 """Placebos whose largest share is the chance level."""
@@ -48,7 +48,6 @@ class Shares(NamedTuple):
     inside: Float[np.ndarray, " candidate"]
     left_out: Float[np.ndarray, " candidate"]
     folds: Float[np.ndarray, "candidate fold"]
-    directions: Float[np.ndarray, " candidate"]
     coefficients: Float[np.ndarray, " probe"]
     survived: Float[np.ndarray, " candidate"]
     far: Float[np.ndarray, " candidate"]
@@ -60,15 +59,12 @@ class Screened(NamedTuple):
     candidate: Candidate
     coefficients: Float[np.ndarray, " probe"]
     """Multiples of its probes."""
-    directions: int
     share: Share
     band: int
     floor: float
     """Smallest share that counts at that band."""
     chance: float
     """Largest share of any placebo at that band that the parts left out confirm."""
-    independent: float
-    """Number of independent errors."""
     survived: float = 1.0
     """Norm of its columns that friction and parameters cannot give, over their norm [0 to 1]."""
     far: float = 0.0
@@ -208,23 +204,23 @@ def shares(rows: Rows, candidates: Sequence[Candidate], timed: Sequence[bool]) -
     where, sizes = spans(candidates), np.array([len(c.probes) for c in candidates])
     once = {id(c): _ridge(c) for c in {id(c): c for c in candidates}.values()}
     ridge = [once[id(c)] for c in candidates]
-    inside, left_out, directions = np.zeros((3, len(candidates)))
+    inside, left_out = np.zeros((2, len(candidates)))
     survived = np.array([rows.survived[span].max(initial=0.0) for span in where])
     folds, coefficients = np.zeros((len(candidates), len(held))), np.zeros(where[-1].stop)
     for size in np.unique(sizes) if len(held) > 1 else ():  # of one fold nothing can be left out
         indices = np.flatnonzero(sizes == size)
         places = np.array([np.arange(where[int(i)].start, where[int(i)].stop) for i in indices])
         sums = _sums(rows, places, np.array([ridge[int(i)] for i in indices]))
-        gone, coefficients[places], directions[indices] = sums.fitted()
-        count = np.maximum(len(rows.error) / rows.overlap, directions[indices] + 2)
-        inside[indices] = 1 - (1 - gone / total) * (count - 1) / (count - directions[indices] - 1)
+        gone, coefficients[places], directions = sums.fitted()
+        count = np.maximum(len(rows.error) / rows.overlap, directions + 2)
+        inside[indices] = 1 - (1 - gone / total) * (count - 1) / (count - directions - 1)
         out = np.stack([sums.left_out(fold == f) for f in np.unique(fold)], axis=1)
         folds[indices] = out / np.where(out < 0, np.maximum(held, held.mean()), held)
         moments = sum(sums.left_out(block == b) for b in np.unique(block))
         least = np.where(np.asarray(timed)[indices], np.inf, moments)
         left_out[indices] = np.minimum(out.sum(axis=1), least) / total
     far = np.array([np.sqrt(np.mean(coefficients[span] ** 2 * r)) for span, r in zip(where, ridge, strict=True)])
-    return Shares(inside, left_out, folds, directions, coefficients, survived, far)
+    return Shares(inside, left_out, folds, coefficients, survived, far)
 
 
 def _ridge(candidate: Candidate) -> Float[np.ndarray, " probe"]:
@@ -242,17 +238,15 @@ class _Band(NamedTuple):
     shares: tuple[Shares, ...]
     columns: Float[np.ndarray, "row probe"]
     """Columns without what the nuisance can explain."""
-    independent: float
-    """Number of independent errors."""
     members: Bool[np.ndarray, "fold seq"]
     """Sequences that each fold holds, or pieces of."""
 
 
-_SHARES = Shares(HERE, HERE, HERE, HERE, HERE, HERE, HERE)
+_SHARES = Shares(HERE, HERE, HERE, HERE, HERE, HERE)
 
 
-@step(lambda loss, _, __, shifts: (_Band((_SHARES,) * (1 + shifts), HERE, HERE, HERE),) * len(loss.bands))
-def _bands(loss: AbstractLoss, fit: SmoothedFit, candidates: Sequence[Candidate], shifts: int) -> tuple[_Band, ...]:
+@step(lambda loss, _, __, shifts: (_Band((_SHARES,) * (1 + shifts), HERE, HERE),) * len(loss.bands))
+def _bands(loss: MultiStep, fit: SmoothedFit, candidates: Sequence[Candidate], shifts: int) -> tuple[_Band, ...]:
     """The screen of every band.
 
     The seed of the placebos is fixed, so that the same data give the same chance level.
@@ -276,7 +270,7 @@ def _band(fit: SmoothedFit, candidates, precision, pull, linearised: Linearised,
     every = shares(rows, [*candidates] * count, timed * count)
     split = tuple(Shares(*some) for some in zip(*(np.split(a, count) for a in every), strict=True))
     held = members(fold, np.asarray((linearised.weight > 0).any(axis=2)))
-    return _Band(split, rows.columns[:, :size].astype(np.float32), len(rows.error) / rows.overlap, held)
+    return _Band(split, rows.columns[:, :size].astype(np.float32), held)
 
 
 def _joined(blocks: Sequence[_Band]) -> _Band:
@@ -295,7 +289,7 @@ class Screen(NamedTuple):
     """Sequences that each fold holds, or pieces of, by band."""
 
 
-def screen(loss: AbstractLoss, fit: SmoothedFit, candidates: Sequence[Candidate], shifts: int = SHIFTS) -> Screen:
+def screen(loss: MultiStep, fit: SmoothedFit, candidates: Sequence[Candidate], shifts: int = SHIFTS) -> Screen:
     """Every candidate at the first band of horizons that shows it, else at that of the largest multiple of its bar.
 
     Bands are in the order of what they prove: errors soon after a start show more of what else a model lacks.
@@ -303,21 +297,21 @@ def screen(loss: AbstractLoss, fit: SmoothedFit, candidates: Sequence[Candidate]
     bands = _bands(loss, fit, candidates, shifts)
     out = []
     for number, band in enumerate(bands):
-        (real, *moved), floor = band.shares, loss.bars.floor(band.independent) / loss.remaining_share(fit)
-        placebo = [s for one in moved for s in _screened(one, candidates, number, floor, 0.0, band.independent)]
+        (real, *moved), floor = band.shares, MULTI_STEP / loss.remaining_share(fit)
+        placebo = [s for one in moved for s in _screened(one, candidates, number, floor, 0.0)]
         chance = max([0.0, *(s.share.least for s in placebo if s.admissible)])
-        out.append(_screened(real, candidates, number, floor, chance, band.independent))
+        out.append(_screened(real, candidates, number, floor, chance))
     best = (max(same, key=lambda s: s.rank) for same in zip(*out, strict=True))
     return Screen(tuple(best), tuple(band.columns for band in bands), tuple(b.members for b in bands))
 
 
 def _screened(
-    shares: Shares, candidates: Sequence[Candidate], band: int, floor: float, chance: float, independent: float
+    shares: Shares, candidates: Sequence[Candidate], band: int, floor: float, chance: float
 ) -> Iterator[Screened]:
     for i, (candidate, span) in enumerate(zip(candidates, spans(candidates), strict=True)):
         share = Share(float(shares.inside[i]), float(shares.left_out[i]), tuple(shares.folds[i].tolist()))
-        numbers = band, floor, chance, independent, float(shares.survived[i]), float(shares.far[i])
-        yield Screened(candidate, shares.coefficients[span], round(float(shares.directions[i])), share, *numbers)
+        numbers = band, floor, chance, float(shares.survived[i]), float(shares.far[i])
+        yield Screened(candidate, shares.coefficients[span], share, *numbers)
 
 
 def overlaps(screen: Screen, chosen: Screened) -> list[float]:

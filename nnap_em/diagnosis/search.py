@@ -34,9 +34,8 @@ from .backward import backward
 from .context import SEARCH_EFFORT, SHORT, Effort, SearchContext, Stages, extend, smooth
 from .equations import search_equations
 from .hypothesis import Evidence, Hypothesis, covariances
-from .innovations import white_innovations
 from .keys import Key, key_of, remainder_of, replaced, words
-from .losses import AbstractLoss, MultiStep, OneStep
+from .losses import MultiStep
 from .outcome import Diagnosis, Step, Suspect
 from .quantised import quantised
 from .rounds import Round, screening_round
@@ -44,6 +43,9 @@ from .smoothed import along, risen_since
 from .trial import Trial, certainty
 from .undisturbed import disturbance_free
 from .verdict import DETERMINED, FOLLOWED, HELD, Rejection, even
+
+FAILURES = (ArithmeticError, ValueError, RuntimeError)
+"""Numerical failures: those of NumPy and SciPy are ValueErrors, those of JAX and `FitError` RuntimeErrors."""
 
 
 def _forward(context: SearchContext, hypothesis: Hypothesis, length: int, steps: list[Step]) -> Hypothesis:
@@ -58,11 +60,11 @@ def _forward(context: SearchContext, hypothesis: Hypothesis, length: int, steps:
         return hypothesis
     outcome = screening_round(fit, context)
     steps.append(outcome.step)
-    if outcome.step.untried:
+    if not outcome.complete:
         raise TimeUp
     if outcome.accepted is None:
         return hypothesis
-    return _with(hypothesis, outcome.accepted, _evidence(outcome, context.loss), context)
+    return _with(hypothesis, outcome.accepted, _evidence(outcome), context)
 
 
 def _with(hypothesis: Hypothesis, case: Trial, evidence: Evidence, context: SearchContext) -> Hypothesis:
@@ -87,40 +89,33 @@ def _names(hypothesis: Hypothesis) -> frozenset[tuple[tuple[Key, Any], int]]:
     return frozenset(Counter((key_of(e), jax.tree.structure(e)) for e in hypothesis.model.effects).items())
 
 
-def _evidence(outcome: Round, loss: AbstractLoss) -> Evidence:
+def _evidence(outcome: Round) -> Evidence:
     """Evidence for an accepted law, with its equivalents."""
     case = cast(Trial, outcome.accepted)
     screened, share = case.screened, case.screened.share
-    evidence = Evidence(equivalent=outcome.equivalent, removed=case.removed, candidate=case.candidate)
-    if loss.multi_step:  # a likelihood proves nothing there
-        parts = sum(part > 0 for part in share.folds), len(share.folds)
-        return evidence._replace(share=share.left_out, chance=screened.chance, parts=parts)
-    p_value = float(stats.chi2.sf(2 * max(case.gain, 0.0), max(screened.directions, 1))) * outcome.step.tried
-    held_out = 0.5 * share.left_out * screened.independent
-    return evidence._replace(gain=case.gain, held_out=held_out, p_value=min(1.0, p_value))
+    parts = sum(part > 0 for part in share.folds), len(share.folds)
+    found = {"share": share.left_out, "chance": screened.chance, "parts": parts, "removed": case.removed}
+    return Evidence(equivalent=outcome.equivalent, candidate=case.candidate, **found)
 
 
 def search(context: SearchContext, *, release: Callable[[Identified, Dataset], Identified]) -> Diagnosis:
-    """Search for what the declared model lacks, by multi-step errors; `release` ends the fit of the outcome.
-
-    Where readings carry white noise and what is left is white, too, one-step errors show last what is too weak for
-    many steps: of a model that lacks more they prove nothing.
-    """
-    before, data = context.before, context.data
+    """Search for what the declared model lacks, by multi-step errors; `release` ends the fit of the outcome."""
+    before = context.before
     try:  # steps of readings as noise: they spoil the noise that all else leans on
         steps_tried = SensorQuantization in context.kinds and not context.change
         begun = quantised(context, context.declared) if steps_tried else (context.declared, None)
-    except FitError as error:
-        context.log(f"  with steps of readings as noise no sequence can be followed to its end ({error})")
+    except FAILURES as error:
+        context.log(f"  with steps of readings as noise the fit fails ({error})")
         begun = context.declared, None
     lengths = _ladder(context) if context.white and before.model.hides else [_first(context)]
-    hypothesis, state, steps, complete = _search(context, *begun, lengths)
-    if context.white and complete and white_innovations(_outcome(before, hypothesis, state), data):
-        last = _search(context._replace(loss=OneStep()), hypothesis, state, _ladder(context))
-        hypothesis, state, steps, complete = last._replace(steps=steps + last.steps)
-    hypothesis, outcome, steps = _determined(context, hypothesis, state, steps, release)
+    hypothesis, state, steps, complete, failure = _search(context, *begun, lengths)
+    outcome = _outcome(before, hypothesis, state)
+    try:
+        hypothesis, outcome, steps = _determined(context, hypothesis, state, steps, release)
+    except FAILURES as error:
+        complete, failure = False, failure or _told(context, error)
     found = cast(tuple[Evidence, ...], hypothesis.evidence)
-    return Diagnosis(before, outcome or before, found, tuple(steps), complete=complete)
+    return Diagnosis(before, outcome or before, found, tuple(steps), complete=complete, failure=failure)
 
 
 def _determined(
@@ -171,7 +166,7 @@ def _ladder(context: SearchContext) -> list[int]:
 
 
 def _first(context: SearchContext) -> int:
-    """Rows of the first round by multi-step errors: all, or if most sequences diverge before, as many as most keep."""
+    """Rows of the first round: all, or if most sequences diverge before, as many as most keep."""
     followed = {length: np.mean(used) for length, (_, used) in context.stages.items()}
     most = [length for length, share in followed.items() if share >= FOLLOWED]
     return max(most, default=min(followed, default=context.longest))
@@ -181,21 +176,30 @@ def _outcome(before: Identified, hypothesis: Hypothesis, state: EMState | None) 
     return before if state is None else before._replace(state=state, m_step=hypothesis.m_step)
 
 
+def _told(context: SearchContext, error: Exception) -> str:
+    """The first line of a failure, after a line of progress on it."""
+    text = (str(error).strip().splitlines() or [type(error).__name__])[0]
+    context.log(f"the search is stopped by a numerical failure ({text}); what was found before is kept")
+    return text
+
+
 class _Searched(NamedTuple):
-    """Outcome of a search by one loss."""
+    """Outcome of a search."""
 
     hypothesis: Hypothesis
     state: EMState | None
     """Its fit over the whole length; None for the declared model."""
     steps: list[Step]
     complete: bool = True
+    failure: str = ""
+    """Numerical failure that ended it."""
 
 
 def _search(context: SearchContext, hypothesis: Hypothesis, state: EMState | None, lengths: list[int]) -> _Searched:
-    """Forward selection and backward elimination by one loss, until neither changes anything or the time is up.
+    """Forward selection and backward elimination, until neither changes anything or the time is up.
 
     The rounds use `lengths` rows in turn, then, and after the first law at once, all.  A law that was accepted
-    in time is fitted over the whole length, however long that takes.
+    in time is fitted over the whole length, however long that takes.  A round that fails ends it.
     """
     searched: set[frozenset] = set()
     steps: list[Step] = []
@@ -219,10 +223,12 @@ def _search(context: SearchContext, hypothesis: Hypothesis, state: EMState | Non
         except TimeUp:
             context.log("the time is up: the search is not finished")
             return _Searched(hypothesis, state, steps, complete=False)
+        except FAILURES as error:
+            return _Searched(hypothesis, state, steps, complete=False, failure=_told(context, error))
         try:
             hypothesis, state = proposed, extend(context, proposed, length) if proposed.evidence else None
-        except FitError as error:
-            context.log(f"  with the new law no sequence can be followed to its end ({error}); it is removed")
+        except FAILURES as error:
+            context.log(f"  with the new law the fit fails ({error}); it is removed")
             steps[-1] = steps[-1]._replace(accepted=None)
             return _Searched(hypothesis, state, steps)
         if _names(hypothesis) in searched:

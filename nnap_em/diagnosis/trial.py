@@ -13,7 +13,7 @@ from .context import SearchContext
 from .findings import estimates
 from .hypothesis import Hypothesis, covariances
 from .keys import complexity, replaced
-from .losses import AbstractLoss
+from .losses import MultiStep
 from .propose import seeded
 from .refit import Refit, refit
 from .screen import Screened
@@ -29,14 +29,12 @@ class Trial(NamedTuple):
     """The model with it."""
     removed: float
     """Share of the squared error that it removes, at the horizons by which its band is judged."""
-    gain: float
-    """Log-likelihood over the model without it [nat]."""
     certainty: float
     """Wald statistic of its strengths, jointly [standard deviations]."""
     amplitude: float
     """The same of its reported amplitude alone; infinite for a law that reports none."""
     foreseen: float = np.nan
-    """Share that the step of the screen removes, before any pass; NaN where likelihood decides."""
+    """Share that the step of the screen removes, before any pass."""
     refit: Refit | None = None
     """Its fit; None where the step of the screen removed too little for one."""
     before: float = -np.inf
@@ -68,23 +66,23 @@ class Null(NamedTuple):
     end: Refit
 
 
-def begun(hypothesis: Hypothesis, path: Gaussian, fit: SmoothedFit, loss: AbstractLoss) -> Refit:
+def begun(hypothesis: Hypothesis, path: Gaussian, fit: SmoothedFit, loss: MultiStep) -> Refit:
     """`hypothesis` before any pass, finished on the data of the loss along a path."""
     return loss.finish(fit, Refit(hypothesis.model, hypothesis.m_step, path, np.zeros(0), jnp.zeros((0, 0))))
 
 
-def fitted(start: Refit, fit: SmoothedFit, loss: AbstractLoss, passes: int) -> Refit:
+def fitted(start: Refit, fit: SmoothedFit, loss: MultiStep, passes: int) -> Refit:
     """A refit after some passes from where it was begun, finished again."""
     return loss.finish(fit, refit(start.model, start.m_step, start.path, fit.data, fit.used, passes=passes))
 
 
-def null_of(hypothesis: Hypothesis, fit: SmoothedFit, loss: AbstractLoss, passes: int) -> Null:
+def null_of(hypothesis: Hypothesis, fit: SmoothedFit, loss: MultiStep, passes: int) -> Null:
     """`hypothesis` along the paths of `fit`, before its passes and after them."""
     start = begun(hypothesis, fit.path, fit, loss)
     return Null(start, fitted(start, fit, loss, passes))
 
 
-def with_candidate(forms: Sequence[Screened], null: Null, fit: SmoothedFit, loss: AbstractLoss, passes: int) -> Trial:
+def with_candidate(forms: Sequence[Screened], null: Null, fit: SmoothedFit, loss: MultiStep, passes: int) -> Trial:
     """A law in the model, or in the place of the law that it is another form of, refitted from the one of its `forms`
     whose step removes most and is physical: on the linear screen a friction of three periods may explain what five do.
 
@@ -98,24 +96,22 @@ def with_candidate(forms: Sequence[Screened], null: Null, fit: SmoothedFit, loss
         place = replaced(effect, hypothesis.model)
         full = (hypothesis if place is None else hypothesis.without(place)).plus(effect, form.candidate)
         start = begun(full, extended(full.model, fit.path, fit.data), fit, loss)
-        share = 1 - loss.ratio(null.start, start, fit, form.band) if loss.multi_step else np.nan
+        share = 1 - loss.ratio(null.start, start, fit, form.band)
         return (start.model.effects[-1].is_physical(), share), form, full, start
 
     (_, foreseen), screened, full, start = max(map(stepped, forms), key=lambda step: step[0])
     candidate = screened.candidate
-    must_fall = loss.multi_step and not hypothesis.model.hides
-    if must_fall and not needed(foreseen, FORESEEN * required(screened.floor, complexity(candidate.start))):
-        return Trial(screened, full.refitted(start.model), foreseen, np.nan, np.inf, np.inf, foreseen)
+    bar = 0.0 if hypothesis.model.hides else required(screened.floor, complexity(candidate.start))
+    if bar and not needed(foreseen, FORESEEN * bar):
+        return Trial(screened, full.refitted(start.model), foreseen, np.inf, np.inf, foreseen)
     end = fitted(start, fit, loss, passes)
     after = full.refitted(end.model)
-    gain = np.nan_to_num(end.loglik, nan=-1e3) - np.nan_to_num(null.end.loglik, nan=-1e3)
     effect, cov = after.model.effects[-1], covariances(after.model, after.m_step, end.hessian)[-1]
     reported = estimates(effect, cov, after.model.system).get("amplitude")
     return Trial(
         screened,
         after,
         1 - loss.ratio(null.end, end, fit, screened.band),
-        float(np.sum(gain[fit.used])),
         certainty(candidate, effect, cov),
         reported.value / reported.std if reported and reported.std > 0 else np.inf,
         foreseen,

@@ -1,10 +1,9 @@
 """Numbers that decide whether an effect enters a model or leaves it, and the decisions.
 
-The search measures; this file decides, in the same way for every loss.  A share is the part of a squared error that a
-candidate removes [0 to 1]; for one-step errors, twice the gain in log-likelihood over the number of readings.
-Elsewhere: READINGS (`em/noise.py`) and WHITE (`innovations.py`, `statistics.py`), which choose the loss; the bars of
-external disturbances (`interventions.py`, `undisturbed.py`) and of the shape of a curve (`shapes.py`); and counts of
-parts, placebos, laws and passes (`folds.py screen.py rounds.py refit.py context.py columns.py equations.py`).
+The search measures; this file decides.  A share is the part of a squared error that a candidate removes [0 to 1].
+Elsewhere: READINGS (`em/noise.py`), which chooses the horizons where a joint is hidden; the bars of external
+disturbances (`interventions.py`, `undisturbed.py`) and of the shape of a curve (`shapes.py`); and counts of parts,
+placebos, laws and passes (`folds.py screen.py rounds.py refit.py context.py columns.py equations.py`).
 """
 
 import math
@@ -38,9 +37,6 @@ EQUIVALENT = 0.9
 refits decide between others, and between laws of different causes the question stays open."""
 EQUIVALENT_NATS = 5.0
 """Log-likelihood [nat] within which two laws are indistinguishable: 1 in 150."""
-PRICE = 1.0
-"""Log-likelihood [nat] that a law pays for each of its numbers where laws are compared: chance gives half of it
-[Akaike 1974, IEEE Trans. Automatic Control 19(6)]."""
 SAME = 0.01
 """Share of the information on an effect that an equivalent one may leave unexplained."""
 FORESEEN = 1 / 3
@@ -72,23 +68,9 @@ FINEST = 0.25
 """Smallest share of an estimated variance of a reading that is noise beside the rounding in it."""
 
 
-class Bars(NamedTuple):
-    """Smallest share and smallest gain that count, whatever chance can do."""
-
-    share: float
-    """Smallest share that counts: below it an effect that is not in the catalogue looks like some law that is."""
-    nats: float
-    """Smallest gain in log-likelihood that counts [nat]."""
-
-    def floor(self, count: float) -> float:
-        """The larger of both as a share of `count` independent errors."""
-        return max(self.share, 2 * self.nats / max(count, 1.0))
-
-
-MULTI_STEP = Bars(0.15, 0.0)
-"""Three real rigs as recorded: aliases of what their models lack remove up to 0.14."""
-ONE_STEP = Bars(0.004, 12.0)
-"""400 candidates gain 6 nat by chance; 0.002 nat a reading are certain with many readings, and nobody would notice."""
+MULTI_STEP = 0.15
+"""Smallest share that counts, whatever chance can do: aliases of what their models lack remove up to 0.14 on three real
+rigs as recorded, and below it an effect that is not in the catalogue looks like some law that is."""
 
 
 class Share(NamedTuple):

@@ -128,13 +128,15 @@ def open_loop(
     return OpenLoop(errors(along, horizons) if error is None else error, columns, overlap)
 
 
-def errors(along: Followed, horizons: tuple[float, ...] = HORIZONS) -> Float[np.ndarray, "seq start horizon obs"]:
-    """The errors alone [rad, or m]; NaN where there is none."""
+def errors(
+    along: Followed, horizons: tuple[float, ...] = HORIZONS, see: tuple[int, ...] = ()
+) -> Float[np.ndarray, "seq start horizon obs"]:
+    """The errors alone [rad, or m], of the readings `see` or those that are compared; NaN where there is none."""
     grid, rows = _grid(along.model, along.data, horizons), along.state.shape[1]
     ages = np.pad(grid.ages, (0, max(0, len(HORIZONS + SHORT_HORIZONS) - len(grid.ages))), mode="edge")
     numbers = along.model, jnp.arange(grid.stride, rows, grid.stride), jnp.asarray(ages)  # one program for all horizons
     error = np.asarray(each(_errors, numbers, (along.state, along.linear.seq)))
-    return error[:, : len(grid.starts(rows)), : len(grid.ages), channels(along.model)]
+    return error[:, : len(grid.starts(rows)), : len(grid.ages), see or channels(along.model)]
 
 
 def _grid(model: StateSpaceModel, data: Dataset, horizons: tuple[float, ...] = HORIZONS) -> Grid:

@@ -65,7 +65,7 @@ def write_diagnosis(
     ]
     disputed, rivals, suspects = disputes(diagnosis, train.files), undecided(diagnosis), suspected(diagnosis)
     failed = sum(t.p_value < 0.01 and not t.slight for t in tested["before"])
-    outcome, far = verdict(accepted, error, failed, rivals, suspects, diagnosis.complete), moved(diagnosis.after)
+    outcome, far = verdict(accepted, error, failed, rivals, suspects, diagnosis.unfinished), moved(diagnosis.after)
     if diagnosis.change:
         outcome, far = changes(diagnosis, accepted, error), []
     command = "nnap-em design FIT --out NEXT, FIT this folder: the most informative inputs, ready to be played."

@@ -31,7 +31,6 @@ MOST_PICTURES, PICTURE_BYTES = 5, 900_000
 _NATS = ((100, "Beyond doubt"), (30, "Very sure"), (10, "Sure"), (3, "Likely"))
 _TRUST = {
     "share_of_error": ((0.6, "Very sure"), (0.3, "Sure"), (0.15, "Likely")),
-    "held_out_gain": _NATS,
     "log_likelihood_gain": _NATS,
 }
 """Thresholds of words: share of the error on recordings left out, log-likelihood [nat]; the first known
@@ -126,7 +125,7 @@ def _environment() -> jinja2.Environment:
         loader=loader, autoescape=True, undefined=jinja2.ChainableUndefined, trim_blocks=True, lstrip_blocks=True
     )
     environment.filters["grouped"] = grouped
-    names = ("number", "with_std", "quantity", "chance", "p_value", "label", "sentence", "share")
+    names = ("number", "with_std", "quantity", "p_value", "label", "sentence", "share")
     environment.filters |= {name: getattr(wording, name) for name in names} | {"trust": _trust, "highest": _highest}
     environment.tests |= {"finite": finite, "failed": _fails}
     environment.globals |= {"most": MOST_PICTURES, "catalogue": catalogue, "level": FAILS, "at": _at, "ratio": ratio}

@@ -9,15 +9,6 @@ from ..diagnosis.keys import words
 from ..numerics.digits import finite, number, share_of, ten, with_std
 
 
-def chance(p: float) -> str:
-    """A small probability in words."""
-    if p < 1e-12:
-        return "less than one in a million million"
-    if p < 1e-3:
-        return f"about one in {ten(round(-math.log10(p)))}"
-    return f"about one in {1 / p:.0f}" if p < 0.1 else number(p, 2)
-
-
 def p_value(p: Any) -> str:
     """A p-value; below 1e-6 the tails of a test are not those of its distribution, and no digits mean anything."""
     return f"< {ten(-6)}" if finite(p) and p < 1e-6 else number(p, 2)

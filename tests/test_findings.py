@@ -12,10 +12,10 @@ import pytest
 from nnap_em.data.dataset import Dataset
 from nnap_em.data.logs import Logs
 from nnap_em.data.rig import Declared, Rig
-from nnap_em.diagnosis.findings import advice, disputes, entry, estimates, findings, suspected, undecided, verdict
+from nnap_em.diagnosis.findings import advice, entry, estimates, findings, suspected, undecided, verdict
 from nnap_em.diagnosis.hypothesis import Evidence, Hypothesis
 from nnap_em.diagnosis.keys import key_of
-from nnap_em.diagnosis.outcome import Diagnosis, Disputed, Step, Suspect
+from nnap_em.diagnosis.outcome import Diagnosis, Step, Suspect
 from nnap_em.effects import AbstractEffect, Candidate, catalogue
 from nnap_em.effects.function import Axis
 from nnap_em.fit.identify import begin
@@ -52,7 +52,7 @@ def _closed(rig: Rig, *effects: AbstractEffect) -> Diagnosis:
     hypothesis = Hypothesis(before.model, before.m_step)
     for effect in effects:
         candidate = Candidate(effect, (effect,), effect)
-        hypothesis = hypothesis.plus(effect, candidate, Evidence(100.0, 50.0, 1e-20))
+        hypothesis = hypothesis.plus(effect, candidate, Evidence(100.0))
     model, rule, found = hypothesis
     size = before.state.hessian.shape[0] + rule.prior.size - before.m_step.prior.size
     state = before.state._replace(model=model, best=model, hessian=1e4 * jnp.eye(size))
@@ -122,9 +122,9 @@ def test_a_law_of_known_form_has_no_shape():
 
 
 def _doubtful() -> Diagnosis:
-    """A search that saw a gain on which the second recording disagrees, and a spring and a dead zone that are even."""
-    gain, zone, spring = (key_of(e) for e in (_law("motor_gain"), _law("dead_zone"), _spring(1)))
-    last = Step(ROWS, (), (), None, 3, disputed=(Disputed(gain, 0.8, (1,), 0.61),), rivals=(zone, spring))
+    """A search that saw a spring and a dead zone that are even."""
+    zone, spring = (key_of(e) for e in (_law("dead_zone"), _spring(1)))
+    last = Step(ROWS, (), (), None, 3, rivals=(zone, spring))
     return _closed(ARM)._replace(steps=(Step(ROWS, (), (), zone, 3), last))
 
 
@@ -140,27 +140,11 @@ def test_a_fit_says_what_it_was_fitted_to():
     assert identification._verdict(fitted, 4, 0) == "Fitted the noise to 4 sequences in 0 epochs."
 
 
-def test_a_recording_that_disagrees_is_named():
-    (dispute,) = disputes(_doubtful(), ("a.csv", "b.csv"))
-    assert (dispute.name, dispute.joint, dispute.files) == ("motor_gain", 2, ["b.csv"])
-    assert dispute.description == (
-        "motor gain at joint 2 would remove 80% of the prediction error, "
-        "but b.csv shows the opposite (up to 61% more error)"
-    )
-    assert any("b.csv" in text for text in advice([], [dispute]))
-    both = _doubtful().last[-1].disputed[0]._replace(against=(0, 1))
-    (dispute,) = disputes(
-        _doubtful()._replace(steps=(Step(ROWS, (), (), None, 3, disputed=(both,)),)), ("a.csv", "b.csv")
-    )
-    assert "a.csv and b.csv show the opposite" in dispute.description
-    assert not disputes(_closed(ARM), ("a.csv", "b.csv"))
-
-
 def test_what_cannot_be_told_is_a_verdict():
     rivals = undecided(_doubtful())
     text = verdict([], None, 3, rivals)
     assert "cannot tell" in text and "dead zone at joint 2 and torsional spring at joint 1" in text
-    assert len(advice([], (), rivals)) == 2
+    assert len(advice([], rivals)) == 2
     assert "cannot tell" not in verdict([], None, 3)
 
 
@@ -173,14 +157,14 @@ def test_a_suspect_is_named_with_its_share_and_the_chance_level():
     )
     assert verdict([], None, 3, (), [suspect]).startswith("No effect is certain to be missing. Suspected: motor gain")
     assert "certain" not in verdict([], None) and not suspected(_closed(ARM))
-    first, second, *_ = advice([], [], (), [suspect])
+    first, second, *_ = advice([], (), [suspect])
     assert "record as many different motions" in first
     assert second == f"To see a motor gain at joint 2 by itself: {catalogue['motor_gain'].confirm}"
     for law, named in (
         ("unknown function of u", "an unknown function of u"),
         ("cogging at joint 1", "cogging at joint 1"),
     ):
-        assert advice([], [], (), [suspect._replace(law=law)])[1].startswith(f"To see {named} by itself")
+        assert advice([], (), [suspect._replace(law=law)])[1].startswith(f"To see {named} by itself")
 
 
 @pytest.mark.slow
@@ -194,12 +178,12 @@ def test_the_page_tells_what_is_in_doubt(tmp_path):
     joints = report["visited"]
     assert [row["load"] is None for row in joints] == [True, False]  # the second is driven
     assert all(row["velocity"][0] < row["velocity"][1] for row in joints)
-    assert report["effects"] == [] and report["disagreements"][0]["files"] == ["b.csv"]
+    assert report["effects"] == []
     assert [(rival["name"], rival["joint"]) for rival in report["undecided"]] == [
         ("dead_zone", 2),
         ("torsional_spring", 1),
     ]
-    assert "b.csv shows the opposite" in html and "cannot tell what" in html
+    assert "cannot tell what" in html
     assert [(each["name"], each["chance"]) for each in report["suspects"]] == [("motor_gain", 0.03)]
     assert "<h2>Suspects" in html.replace(' id="suspects"', "") and "chance removes up to 3%" in html
 

@@ -71,7 +71,7 @@ def _screened(asked, candidates):
     model, rule, data, path, _ = asked
     data = jax.tree.map(jnp.asarray, data)
     bare = Hypothesis(model, rule)
-    return screen(MultiStep(), SmoothedFit(bare, bare, path, data, np.ones(COUNT, bool), ROWS), candidates).screened
+    return screen(MultiStep(), SmoothedFit(bare, bare, path, data, np.ones(COUNT, bool), ROWS), candidates)
 
 
 def _functions(around):

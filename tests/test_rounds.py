@@ -19,7 +19,7 @@ from nnap_em.diagnosis.keys import contains, elsewhere, key_of
 from nnap_em.diagnosis.losses import MultiStep
 from nnap_em.diagnosis.refit import Refit
 from nnap_em.diagnosis.rounds import screening_round
-from nnap_em.diagnosis.screen import Screen, Screened
+from nnap_em.diagnosis.screen import Screened
 from nnap_em.diagnosis.smoothed import SmoothedFit
 from nnap_em.diagnosis.trial import Trial
 from nnap_em.diagnosis.verdict import Share
@@ -61,7 +61,6 @@ def _run(
     entries,
     errors=None,
     hypothesis=BARE,
-    members=None,
     shortlist=8,
     steps=None,
     risen=None,
@@ -88,12 +87,10 @@ def _run(
             return Trial(screened, after, 0.0, np.inf, np.inf, 0.0)
         return Trial(screened, after, removed, 12.0, np.inf, 0.5, object())
 
-    size = sum(len(s.candidate.probes) for s in entries)
-    seen = Screen(tuple(entries), (np.eye(size),) * 2, (np.eye(3, 6, dtype=bool) if members is None else members,) * 2)
     monkeypatch.setattr(rounds, "surroundings", lambda *_, **__: None)
     monkeypatch.setattr(AbstractEffect, "visible", lambda *_: True)
     monkeypatch.setattr(rounds, "proposals", lambda *_: [])
-    monkeypatch.setattr(rounds, "screen", lambda *_: seen)
+    monkeypatch.setattr(rounds, "screen", lambda *_: tuple(entries))
     monkeypatch.setattr(rounds, "null_of", lambda *_: None)
     monkeypatch.setattr(rounds, "with_candidate", refit)
     fit = SmoothedFit(BARE, hypothesis, None, DATA, np.ones(6, bool), 9)
@@ -250,26 +247,6 @@ def test_laws_of_other_causes_that_explain_the_same_leave_the_question_open(monk
         assert set(outcome.step.rivals) == {key_of(e.candidate.start) for e in entries}
 
 
-def test_laws_whose_columns_are_the_same_are_equivalent(monkeypatch):
-    """Two of three candidates have proportional columns."""
-    entries = [_screened(_law("motor_gain"), 0.5), _screened(_law("dead_zone"), 0.2), _screened(_spring(), 0.2)]
-    outcome, _ = _run(monkeypatch, entries)
-    columns = np.array([[2.0, 1.0, 0.05], [0.0, 0.0, np.sqrt(1 - 0.05**2)]], np.float32)
-    seen = outcome.screen._replace(columns=(columns,))
-    assert rounds.overlaps(seen, seen.screened[0]) == pytest.approx([0.0, 0.0, 1 - 0.01 / 4], abs=1e-5)
-
-
-@pytest.mark.parametrize(("sine", "cosine", "left"), [(0.0, 2.0, 0.0), (1.0, 0.0, 1.0), (1.0, 1.0, 0.5)])
-def test_a_law_of_two_strengths_is_equivalent_to_one_that_gives_what_was_fitted(sine, cosine, left):
-    """A ripple, whose cosine is a tilt: the two have one column in common."""
-    ripple = _screened(_law("air_drag"), 0.5)
-    ripple = ripple._replace(candidate=ripple.candidate._replace(probes=ripple.candidate.probes * 2))
-    ripple = ripple._replace(coefficients=np.asarray([sine, cosine]))
-    columns = np.eye(4)[:, [0, 1, 1]]
-    seen = Screen((ripple, _screened(_spring(), 0.4)), (columns,), (np.eye(3, 6, dtype=bool),))
-    assert rounds.overlaps(seen, ripple) == pytest.approx([0.0, left], abs=1e-6)
-
-
 def test_the_best_of_every_kind_stands_for_it(monkeypatch):
     entries = [_screened(_law("air_drag", v), share) for v, share in ((1.0, 0.1), (2.0, 0.4), (3.0, 0.2))]
     outcome, _ = _run(monkeypatch, entries)
@@ -296,18 +273,6 @@ def test_suspects_are_near_the_best_and_over_chance_with_named_laws_first(monkey
     assert not tried
     assert [suspect.key[0] for suspect in outcome.step.suspects] == names
     assert all(suspect.chance == chance for suspect in outcome.step.suspects)
-
-
-def test_a_law_on_which_recordings_disagree_is_told_with_those_against_it(monkeypatch):
-    members = np.array([[True, True, False, False], [False, False, True, False], [False, False, False, True]])
-    law = _screened(_law("motor_gain"), 0.5, folds=(0.8, 0.8, -0.6))
-    outcome, tried = _run(monkeypatch, [law, _screened(_law("dead_zone"), 0.05)], members=members)
-    assert not tried
-    assert len(outcome.step.disputed) == 1
-    dispute = outcome.step.disputed[0]
-    assert (dispute.key, dispute.share, dispute.against, dispute.harm) == (key_of(_law("motor_gain")), 0.5, (3,), 0.6)
-    weak = _screened(_law("motor_gain"), 0.14, folds=(0.8, 0.8, -0.6))
-    assert not _run(monkeypatch, [weak], members=members)[0].step.disputed
 
 
 @pytest.mark.parametrize(("errors", "joint"), [((0.27, 0.35), 1), ((0.35, 0.27), 2)])

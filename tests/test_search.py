@@ -24,7 +24,7 @@ from nnap_em.diagnosis.outcome import Step, Suspect
 from nnap_em.diagnosis.propose import seeded
 from nnap_em.diagnosis.refit import Refit
 from nnap_em.diagnosis.rounds import Round
-from nnap_em.diagnosis.screen import Screen, Screened
+from nnap_em.diagnosis.screen import Screened
 from nnap_em.diagnosis.smoothed import SmoothedFit
 from nnap_em.diagnosis.trial import Null, Trial, certainty
 from nnap_em.diagnosis.verdict import Share
@@ -254,9 +254,9 @@ def _rounds(monkeypatch, *laws):
         law = queue.pop(0) if queue else None
         step = Step(fit.rows, (), (), None if law is None else key_of(law), 400, context.loss.measure)
         if law is None:
-            return Round(step, None, None)
+            return Round(step, None)
         case = _case(law)
-        return Round(step, None, case._replace(after=fit.hypothesis.plus(law, case.screened.candidate)))
+        return Round(step, case._replace(after=fit.hypothesis.plus(law, case.screened.candidate)))
 
     smooth = search.smooth
     monkeypatch.setattr(search, "smooth", lambda *a: (lengths.append(a[2]), smooth(*a))[1])
@@ -296,7 +296,7 @@ def test_a_search_whose_time_is_up_keeps_what_was_accepted_before(monkeypatch, l
             return rounds(fit, context)
         if not left:
             raise TimeUp
-        return Round(Step(9, (), (), None, 400, untried=left), None, None, complete=False)
+        return Round(Step(9, (), (), None, 400, untried=left), None, complete=False)
 
     monkeypatch.setattr(search, "screening_round", late)
     hypothesis, state, steps, complete, _ = search._search(_context(), BARE, None, [9])
@@ -479,7 +479,7 @@ def test_an_equivalent_that_the_motion_does_not_show_takes_no_place(monkeypatch,
     monkeypatch.setattr(backward, "surroundings", lambda *_, **__: None)
     monkeypatch.setattr(backward, "proposals", lambda *_: [_candidate("motor_gain")])
     monkeypatch.setattr(catalogue["motor_gain"], "visible", lambda *_: seen)
-    monkeypatch.setattr(backward, "screen", lambda _, fit, some, shifts: tried.extend(some) or Screen((), (), ()))
+    monkeypatch.setattr(backward, "screen", lambda _, fit, some, shifts: tried.extend(some) or ())
     evidence = _found(0.5)._replace(equivalent=(key_of(_law("motor_gain")),))
     assert not list(
         backward._in_place(_context(), key_of(_law("air_drag")), evidence, SMOOTHED, Null(*2 * [_refit(MODEL)]))

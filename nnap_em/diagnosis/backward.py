@@ -71,7 +71,7 @@ def _without(context: SearchContext, fit: SmoothedFit, full: Refit, place: int) 
     if not both.used.any():  # without it no sequence is followed
         return _Reduced(math.inf)
     null = null_of(both.hypothesis, both, context.loss, context.effort.passes)
-    judged = [(band, ()) for band in range(len(context.loss.bands))]
+    judged: list[tuple[int, tuple[int, ...]]] = [(band, ()) for band in range(len(context.loss.bands))]
     measured, channel = context.before.rig.measured, key_of(effects[place])[2]
     if channel in measured and (own := measured.index(channel)) not in channels(fit.model):
         # Noise that is fitted without its law makes a rate count for nothing: of others the law then removes nothing
@@ -110,6 +110,6 @@ def _in_place(context: SearchContext, law: Key, evidence: Evidence, fit: Smoothe
     every = proposals(around, fit.model.effects, context.kinds)
     keyed = [(key_of(c.start), c) for c in every if c.start.visible(around)]
     some = [c for key, c in keyed if key in evidence.equivalent or (fit.model.effects and elsewhere(key, law))]
-    listed = screen(context.loss, fit, some, shifts=0).screened if some else ()
+    listed = screen(context.loss, fit, some, shifts=0) if some else ()
     for entry in best_of_kind(s for s in listed if s.reached or key_of(s.candidate.start) in evidence.equivalent):
         yield with_candidate([entry], null, fit, context.loss, context.effort.passes)

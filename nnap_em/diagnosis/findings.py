@@ -219,39 +219,6 @@ def friction_change(diagnosis: Diagnosis, velocity: Float[np.ndarray, "dof node"
     return f"Without the effect the learned friction was bent: {', '.join(parts)} of its size."
 
 
-class Dispute(NamedTuple):
-    """A law on which recordings disagree, as it is reported."""
-
-    name: str
-    joint: int | None
-    channel: str | None
-    inputs: list[str]
-    share_of_error: float
-    """Share of the squared error that it would remove."""
-    files: list[str]
-    """Recordings whose error it would increase."""
-    harm: float
-    """Share by which the error would rise on the worst of them."""
-    description: str
-
-
-def disputes(diagnosis: Diagnosis, files: Sequence[str], most: int = 3) -> list[Dispute]:
-    """Laws that the last round would have refitted, had some recordings not contradicted; `files` by sequence."""
-    out = []
-    for dispute in [disputed for step in diagnosis.last for disputed in step.disputed][:most]:
-        against = list(dict.fromkeys(files[diagnosis.pieces[i] if diagnosis.pieces else i] for i in dispute.against))
-        share = share_of(dispute.share, "the prediction error")
-        harm = dispute.harm
-        more = f"{harm:.0%} more error" if harm <= 1 else f"{number(1 + harm)} times the error"
-        text = (
-            f"{words(dispute.key)} would remove {share}, but {listed(against)} "
-            f"{'shows' if len(against) == 1 else 'show'} the opposite (up to {more})"
-        )
-        place, share = place_of(dispute.key), dispute.share
-        out.append(Dispute(**place, share_of_error=share, files=against, harm=harm, description=text))
-    return out
-
-
 class SuspectReport(NamedTuple):
     """A law that removes more of the error than chance and was not accepted, as it is reported."""
 
@@ -292,7 +259,6 @@ def undecided(diagnosis: Diagnosis) -> tuple[Key, ...]:
 
 def advice(
     accepted: Sequence[Finding],
-    disputed: Sequence[Dispute] = (),
     rivals: Sequence[Key] = (),
     suspects: Sequence["SuspectReport"] = (),
 ) -> list[str]:
@@ -304,7 +270,6 @@ def advice(
     out += [
         f"To see {with_article(suspect.law)} by itself: {suspect.confirm}" for suspect in suspects if suspect.confirm
     ]
-    out += [f"{dispute.description}: look at what is different there." for dispute in disputed]
     for finding in accepted:
         if finding.effect.confirm:
             out.append(f"To be sure of the {words(key_of(finding.effect))}: {finding.effect.confirm}")

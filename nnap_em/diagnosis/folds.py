@@ -74,8 +74,3 @@ def parts(
     clock = np.asarray(data.t)[:, rows]
     time_parts = 5  # parts of time: what happens at one moment of every recording is no law
     return fold_of(used, motion, times(clock, data, recording, QUARTERS)), times(clock, data, recording, time_parts)
-
-
-def members(fold: Int[np.ndarray, "seq time"], counts: Bool[np.ndarray, "seq time"]) -> Bool[np.ndarray, "fold seq"]:
-    """Sequences that each fold holds, or pieces of, as far as the moment counts."""
-    return np.array([((fold == f) & counts).any(axis=1) for f in np.unique(fold[counts])]).reshape(-1, len(fold))

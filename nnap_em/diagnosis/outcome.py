@@ -9,18 +9,6 @@ from .interventions import Intervention
 from .keys import Key, key_of, listed, words
 
 
-class Disputed(NamedTuple):
-    """A law on which recordings disagree."""
-
-    key: Key
-    share: float
-    """Share of the squared error that it would remove."""
-    against: tuple[int, ...]
-    """Sequences that it would harm."""
-    harm: float
-    """Share by which the error of the worst part of them would rise."""
-
-
 class Suspect(NamedTuple):
     """A law that removes more of the error than chance, and was not accepted."""
 
@@ -43,8 +31,6 @@ class Step(NamedTuple):
     """Candidates screened."""
     measure: str = "share of the squared error"
     """Name of the share."""
-    disputed: tuple[Disputed, ...] = ()
-    """Best first."""
     rivals: tuple[Key, ...] = ()
     """Laws of other causes that explain the same, so that none of them was added."""
     suspects: tuple[Suspect, ...] = ()

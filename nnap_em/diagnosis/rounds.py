@@ -13,12 +13,12 @@ from ..storage.deadline import TimeUp
 from ..systems import AbstractSystem
 from .context import SearchContext
 from .keys import Key, completed, complexity, contains, elsewhere, key_of, replaced, words
-from .outcome import Disputed, Step, Suspect
+from .outcome import Step, Suspect
 from .propose import proposals, seeded, surroundings
-from .screen import Screen, Screened, overlaps, screen
+from .screen import Screened, screen
 from .smoothed import SmoothedFit
 from .trial import Null, Trial, explained, null_of, with_candidate
-from .verdict import EQUIVALENT, NAMED, SAME, agreed, even, odds, required, simplest, suspected
+from .verdict import EQUIVALENT, NAMED, even, odds, simplest, suspected
 
 _Law = TypeVar("_Law", Screened, Trial)
 
@@ -27,7 +27,6 @@ class Round(NamedTuple):
     """Outcome of a screening round."""
 
     step: Step
-    screen: Screen
     accepted: Trial | None
     equivalent: tuple[Key, ...] = ()
     """Named laws that the data cannot distinguish from the accepted one."""
@@ -40,11 +39,11 @@ def screening_round(fit: SmoothedFit, context: SearchContext) -> Round:
     rig, model = context.before.rig, fit.model
     around = surroundings(rig, model, fit.data, fit.path, fit.rows, change=context.change)
     seen = screen(context.loss, fit, proposals(around, model.effects, context.kinds))
-    fresh = [s for s in seen.screened if s.candidate.start.visible(around) and _fresh(s.candidate.start, fit)]
+    fresh = [s for s in seen if s.candidate.start.visible(around) and _fresh(s.candidate.start, fit)]
     ranked = best_of_kind(s for s in fresh if seeded(s.candidate, s.coefficients).is_physical())
     length = int(np.max(np.sum(np.asarray(fit.data.valid), axis=1)))
     listed = tuple((key_of(s.candidate.start), _listed(s)) for s in ranked)
-    step = Step(length, listed, (), None, len(seen.screened), context.loss.measure, _disputed(fresh, seen))
+    step = Step(length, listed, (), None, len(seen), context.loss.measure)
     admitted = [s for s in ranked if s.reached]
     tried: list[Trial] = []
     complete = True
@@ -61,14 +60,14 @@ def screening_round(fit: SmoothedFit, context: SearchContext) -> Round:
             tried += cases
             admissible = [case for case in cases if case.rejection is None]
             if admissible:
-                return _accepted(admissible, Round(step._replace(refitted=_removals(tried)), seen, None), fit, context)
+                return _accepted(admissible, Round(step._replace(refitted=_removals(tried)), None), fit, context)
             admitted = [s for s in admitted if not any(s is other for other in group)]
     except TimeUp:
         complete = False
     judged = {key_of(case.candidate.start) for case in tried}
     others = [s for s in ranked if key_of(s.candidate.start) not in judged]
     step = step._replace(refitted=_removals(tried), suspects=_suspects(others), untried=len(admitted))
-    return Round(step, seen, None, complete=complete)
+    return Round(step, None, complete=complete)
 
 
 def _group(admitted: Sequence[Screened], model: StateSpaceModel) -> list[Screened]:
@@ -107,12 +106,9 @@ def _accepted(admissible: list[Trial], outcome: Round, fit: SmoothedFit, context
     if not (law.named or context.functions):
         context.log(f"  {words(key_of(law))} is no change: errors have not risen since the fit")
         return outcome._replace(step=outcome.step._replace(suspects=_suspects([best.screened])))
-    candidates = [s.candidate.start for s in outcome.screen.screened]
-    parts = list(zip(candidates, overlaps(outcome.screen, best.screened), strict=True))
-    same = [key_of(c) for c, part in parts if c.named and part < SAME]
-    same += [key_of(case.effect) for case in tied if case.effect.named]
+    same = [key_of(case.effect) for case in tied if case.effect.named]
     equivalent = tuple(key for key in dict.fromkeys(same) if key != key_of(law))
-    return Round(outcome.step._replace(accepted=key_of(best.effect)), outcome.screen, best, equivalent)
+    return Round(outcome.step._replace(accepted=key_of(best.effect)), best, equivalent)
 
 
 def _complexities(laws: Sequence[_Law], model: StateSpaceModel) -> list[int]:
@@ -210,23 +206,3 @@ def _suspects(ranked: Sequence[Screened]) -> tuple[Suspect, ...]:
     over = [s for s in near if suspected(_listed(s), s.floor, s.chance)]
     listed = 4  # the right law was the fourth on a real arm with three recordings
     return tuple(Suspect(key_of(s.candidate.start), s.share.least, s.chance) for s in over[:listed])
-
-
-def _disputed(every: Sequence[Screened], seen: Screen) -> tuple[Disputed, ...]:
-    """The best law of every kind that would reach its bar, had a few recordings not contradicted."""
-    best: dict[Key, Disputed] = {}
-    for screened in every:
-        share, start = screened.share, screened.candidate.start
-        if share.least < required(screened.bar, complexity(start)) or agreed(share.folds, screened.floor):
-            continue
-        folds = np.asarray(share.folds)
-        held = seen.members[screened.band]
-        against = held[folds < 0].any(axis=0)
-        odd = 0 < 2 * against.sum() < held.any(axis=0).sum()  # without odd ones it is no law
-        if not odd or not seeded(screened.candidate, screened.coefficients).is_physical():
-            continue
-        key = key_of(start)
-        entry = Disputed(key, share.least, tuple(map(int, np.flatnonzero(against))), -float(folds.min()))
-        if key not in best or best[key].share < entry.share:
-            best[key] = entry
-    return tuple(sorted(best.values(), key=lambda entry: -entry.share))

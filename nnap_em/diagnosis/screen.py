@@ -18,7 +18,7 @@ from ..effects import Candidate, fields
 from ..em.shape import friction_prior
 from ..storage.journal import HERE, step
 from .columns import blocks_of
-from .folds import members, parts
+from .folds import parts
 from .keys import complexity
 from .losses import Linearised, MultiStep
 from .smoothed import SmoothedFit
@@ -232,22 +232,14 @@ def _ridge(candidate: Candidate) -> Float[np.ndarray, " probe"]:
     return np.array([np.sum(((probe - start) / spread) ** 2) for probe in probes])
 
 
-class _Band(NamedTuple):
-    """Shares of one band, of the candidates and of each placebo."""
-
-    shares: tuple[Shares, ...]
-    columns: Float[np.ndarray, "row probe"]
-    """Columns without what the nuisance can explain."""
-    members: Bool[np.ndarray, "fold seq"]
-    """Sequences that each fold holds, or pieces of."""
-
-
 _SHARES = Shares(HERE, HERE, HERE, HERE, HERE, HERE)
 
 
-@step(lambda loss, _, __, shifts: (_Band((_SHARES,) * (1 + shifts), HERE, HERE),) * len(loss.bands))
-def _bands(loss: MultiStep, fit: SmoothedFit, candidates: Sequence[Candidate], shifts: int) -> tuple[_Band, ...]:
-    """The screen of every band.
+@step(lambda loss, _, __, shifts: ((_SHARES,) * (1 + shifts),) * len(loss.bands))
+def _bands(
+    loss: MultiStep, fit: SmoothedFit, candidates: Sequence[Candidate], shifts: int
+) -> tuple[tuple[Shares, ...], ...]:
+    """Shares of the candidates and of each placebo, by band.
 
     The seed of the placebos is fixed, so that the same data give the same chance level.
     """
@@ -258,7 +250,7 @@ def _bands(loss: MultiStep, fit: SmoothedFit, candidates: Sequence[Candidate], s
     return tuple(map(_joined, zip(*out, strict=True)))
 
 
-def _band(fit: SmoothedFit, candidates, precision, pull, linearised: Linearised, shifts: int) -> _Band:
+def _band(fit: SmoothedFit, candidates, precision, pull, linearised: Linearised, shifts: int) -> tuple[Shares, ...]:
     """The screen of some candidates at one band."""
     count, timed = 1 + shifts, ["time" in c.start.signals(fit.model.system) for c in candidates]
     fold, block = parts(fit.model, fit.path, fit.data, fit.used, fit.recording, linearised.rows)
@@ -268,28 +260,17 @@ def _band(fit: SmoothedFit, candidates, precision, pull, linearised: Linearised,
     columns = np.concatenate([linearised.columns, *moved], axis=-1)
     rows = project(linearised._replace(columns=columns), fold, block, precision, pull)
     every = shares(rows, [*candidates] * count, timed * count)
-    split = tuple(Shares(*some) for some in zip(*(np.split(a, count) for a in every), strict=True))
-    held = members(fold, np.asarray((linearised.weight > 0).any(axis=2)))
-    return _Band(split, rows.columns[:, :size].astype(np.float32), held)
+    return tuple(Shares(*some) for some in zip(*(np.split(a, count) for a in every), strict=True))
 
 
-def _joined(blocks: Sequence[_Band]) -> _Band:
+def _joined(blocks: Sequence[tuple[Shares, ...]]) -> tuple[Shares, ...]:
     """The screen of all candidates at one band."""
-    whole = jax.tree.map(lambda *arrays: np.concatenate(arrays), *(block.shares for block in blocks))
-    return blocks[0]._replace(shares=whole, columns=np.concatenate([block.columns for block in blocks], axis=1))
+    return jax.tree.map(lambda *arrays: np.concatenate(arrays), *blocks)
 
 
-class Screen(NamedTuple):
-    """All candidates before any refit."""
-
-    screened: tuple[Screened, ...]
-    columns: tuple[Float[np.ndarray, "row probe"], ...]
-    """Columns of all probes without what friction and parameters can explain, by band."""
-    members: tuple[Bool[np.ndarray, "fold seq"], ...]
-    """Sequences that each fold holds, or pieces of, by band."""
-
-
-def screen(loss: MultiStep, fit: SmoothedFit, candidates: Sequence[Candidate], shifts: int = SHIFTS) -> Screen:
+def screen(
+    loss: MultiStep, fit: SmoothedFit, candidates: Sequence[Candidate], shifts: int = SHIFTS
+) -> tuple[Screened, ...]:
     """Every candidate at the first band of horizons that shows it, else at that of the largest multiple of its bar.
 
     Bands are in the order of what they prove: errors soon after a start show more of what else a model lacks.
@@ -297,12 +278,11 @@ def screen(loss: MultiStep, fit: SmoothedFit, candidates: Sequence[Candidate], s
     bands = _bands(loss, fit, candidates, shifts)
     out = []
     for number, band in enumerate(bands):
-        (real, *moved), floor = band.shares, MULTI_STEP / loss.remaining_share(fit)
+        (real, *moved), floor = band, MULTI_STEP / loss.remaining_share(fit)
         placebo = [s for one in moved for s in _screened(one, candidates, number, floor, 0.0)]
         chance = max([0.0, *(s.share.least for s in placebo if s.admissible)])
         out.append(_screened(real, candidates, number, floor, chance))
-    best = (max(same, key=lambda s: s.rank) for same in zip(*out, strict=True))
-    return Screen(tuple(best), tuple(band.columns for band in bands), tuple(b.members for b in bands))
+    return tuple(max(same, key=lambda s: s.rank) for same in zip(*out, strict=True))
 
 
 def _screened(
@@ -312,21 +292,3 @@ def _screened(
         share = Share(float(shares.inside[i]), float(shares.left_out[i]), tuple(shares.folds[i].tolist()))
         numbers = band, floor, chance, float(shares.survived[i]), float(shares.far[i])
         yield Screened(candidate, shares.coefficients[span], share, *numbers)
-
-
-def overlaps(screen: Screen, chosen: Screened) -> list[float]:
-    """Share of the information on the `chosen` law, as it is fitted, that each candidate could not give in its place.
-
-    It is 0 for the same model: a ripple of one period a turn may have the amplitude and phase of a tilt.
-    """
-    candidates, columns = [s.candidate for s in screen.screened], screen.columns[chosen.band]
-    where = spans(candidates)
-    reference = where[next(i for i, s in enumerate(candidates) if s is chosen.candidate)]
-    fitted = columns[:, reference] @ np.asarray(chosen.coefficients, float)
-    total, out = fitted @ fitted, []
-    for span in where:
-        some = columns[:, span].astype(float)
-        cross, block = fitted @ some, some.T @ some
-        left = total - cross @ np.linalg.pinv(block, rcond=1e-6, hermitian=True) @ cross
-        out.append(float(np.clip(left / max(total, 1e-300), 0.0, 1.0)))
-    return out

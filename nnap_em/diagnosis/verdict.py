@@ -1,9 +1,10 @@
 """Numbers that decide whether an effect enters a model or leaves it, and the decisions.
 
 The search measures; this file decides.  A share is the part of a squared error that a candidate removes [0 to 1].
-Elsewhere: READINGS (`em/noise.py`), which chooses the horizons where a joint is hidden; the bars of external
-disturbances (`interventions.py`, `undisturbed.py`) and of the shape of a curve (`shapes.py`); and counts of parts,
-placebos, laws and passes (`folds.py screen.py rounds.py refit.py context.py columns.py equations.py`).
+Elsewhere: READINGS (`em/noise.py`), which chooses the horizons where a joint is hidden; the bars of tests of innovations
+(`statistics.py`), of external disturbances (`interventions.py`, `undisturbed.py`) and of the shape of a curve
+(`shapes.py`); and counts of parts, placebos, laws and passes (`folds.py screen.py rounds.py refit.py context.py
+columns.py equations.py`).
 """
 
 import math
@@ -37,8 +38,6 @@ EQUIVALENT = 0.9
 refits decide between others, and between laws of different causes the question stays open."""
 EQUIVALENT_NATS = 5.0
 """Log-likelihood [nat] within which two laws are indistinguishable: 1 in 150."""
-SAME = 0.01
-"""Share of the information on an effect that an equivalent one may leave unexplained."""
 FORESEEN = 1 / 3
 """Multiple of what a refit must remove by which the error must fall along the step of the screen, or none is made."""
 KEEP = 0.6

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..data.logs import Logs
 from ..diagnosis.change import changes
-from ..diagnosis.findings import Finding, advice, disputes, entry, friction_change, suspected, undecided, verdict
+from ..diagnosis.findings import Finding, advice, entry, friction_change, suspected, undecided, verdict
 from ..diagnosis.innovations import tests
 from ..diagnosis.interventions import Intervention
 from ..diagnosis.keys import Key, key_of, place_of, words
@@ -63,7 +63,7 @@ def write_diagnosis(
         *_effect_pictures(accepted),
         *_search_pictures(diagnosis.steps, diagnosis.before.rig.named),
     ]
-    disputed, rivals, suspects = disputes(diagnosis, train.files), undecided(diagnosis), suspected(diagnosis)
+    rivals, suspects = undecided(diagnosis), suspected(diagnosis)
     failed = sum(t.p_value < 0.01 and not t.slight for t in tested["before"])
     outcome, far = verdict(accepted, error, failed, rivals, suspects, diagnosis.unfinished), moved(diagnosis.after)
     if diagnosis.change:
@@ -85,10 +85,9 @@ def write_diagnosis(
         "parameters": {name: parameters(fitted) for name, fitted in both.items()},
         "noise": {name: noise(fitted) for name, fitted in both.items()},
         "rounds": [_round(step, diagnosis.before.rig.dt) for step in diagnosis.steps],
-        "disagreements": disputed,
         "undecided": [place_of(key) for key in rivals],
         "suspects": suspects,
-        "next": [*advice(accepted, disputed, rivals, suspects), *designed],
+        "next": [*advice(accepted, rivals, suspects), *designed],
     }
     write_page(out, document, figures, diagnosis.before.rig.named)
     log(document["verdict"])

@@ -673,10 +673,6 @@ a recording may be harmed by any share
 the larger of two shares
 - return min(self.inside, self.left_out)
 + return max(self.inside, self.left_out)
-## test_verdict.py::test_what_counts_of_a_one_step_error_is_twelve_nats_and_two_thousandths_of_a_nat_a_reading
-a floor that readings lower
-- return max(self.share, 2 * self.nats
-+ return min(self.share, 2 * self.nats
 ## test_verdict.py::test_a_refit_vetoes_what_is_impossible_uncertain_or_small
 a refit that removes next to nothing
 - return share >= KEEP * floor
@@ -782,11 +778,16 @@ a law from one start
 a bump is a cogging
 - >= 3 * np.pi
 + >= 2 * np.pi
-# diagnosis/losses.py
-## test_search.py::test_the_one_step_error_that_a_fit_removes_is_twice_its_gain_over_the_readings
-the gain of a lost sequence counts
-- fit.used & np.isfinite(gain)
-+ fit.used
+# diagnosis/backward.py
+## test_search.py::test_a_law_of_a_rate_is_judged_by_that_reading_too
+a law of a rate is judged by the coordinates alone
+- judged.append((0, (own,)))
++ judged.append((0, ()))
+# diagnosis/rounds.py
+## test_rounds.py::test_a_law_that_is_not_refitted_is_not_listed_as_one_that_was_and_takes_no_place_of_the_shortlist
+laws without a refit fill the shortlist
+- for case in tried if case.refit is not None)
++ for case in tried)
 # diagnosis/folds.py
 ## test_shares.py::test_recordings_of_one_motion_are_left_out_together
 recordings of one motion are evidence of each other

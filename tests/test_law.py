@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.optimize import curve_fit
 
-from nnap_em.model.law import PARAMETERS, LawFit, StribeckLaw, describe, fit_law
+from nnap_em.model.law import PARAMETERS, ROWS, LawFit, StribeckLaw, describe, fit_law, passed
 
 TRUTH = (0.03, 0.05, 0.4, 0.007, 0.1)  # coulomb, breakaway, stribeck, viscous, smooth
 OFFSET = 0.004
@@ -152,7 +152,7 @@ def test_departure_is_found_where_it_is():
 @pytest.mark.parametrize(("nodes", "where"), [([3], "-1.2 rad/s."), ([3, 4, 9], "-1.2 to -0.9, 0.6 rad/s.")])
 def test_a_departure_is_said_where_it_begins_and_ends(nodes, where):
     v, number = np.linspace(-2.1, 2.1, 15)[None], np.ones((1, len(PARAMETERS)))
-    fit = LawFit(number, 0.1 * number, v, 3.0 * np.isin(np.arange(15), nodes)[None], np.ones((1, 15)))
+    fit = LawFit(number, 0.1 * number, v, 3.0 * np.isin(np.arange(15), nodes)[None], np.ones((1, 15)), np.zeros(1))
     assert describe(fit, ("theta1",), (True,))[0].endswith(f"departs from this law at {where}")
 
 
@@ -164,3 +164,29 @@ def test_sentence_reads_as_written():
     )
     assert "viscous 0.007 ± 0.0002 N m s/rad" in text
     assert text.endswith("; the curve agrees with this law within 2 standard deviations.")
+
+
+@pytest.mark.parametrize("rest", [0, 500], ids=["moving", "rests first"])
+@pytest.mark.parametrize(("step", "speed"), [(0.02, 0.0), (0.3, 0.25), (0.9, 0.75)])
+def test_a_speed_is_less_than_a_row_from_rest_where_most_rows_change_the_velocity_by_more(step, speed, rest):
+    """To and fro at a constant acceleration; at rest a smoother leaves some dither."""
+    there = np.arange(-2.0, 2.0, step)
+    moving = np.tile(np.concatenate([there, there[::-1]]), 20)
+    dither = 1e-3 * np.sin(np.arange(rest))
+    velocity = np.stack([np.concatenate([dither, moving]), 0.0 * np.concatenate([dither, moving])], axis=1)
+    nodes = np.tile([-1.0, -0.75, -0.5, -0.25, 0.0, 0.25, 0.5, 0.75, 1.0], (2, 1))
+    np.testing.assert_array_equal(passed(velocity, nodes), [speed, 0.0])
+
+
+@pytest.mark.parametrize(("rows", "stated"), [(ROWS + 0.5, True), (ROWS - 0.5, False)])
+def test_breakaway_and_stribeck_velocity_are_stated_from_two_rows_to_that_velocity_on(rows, stated):
+    v, index = _nodes(), [PARAMETERS.index(name) for name in ("breakaway", "stribeck")]
+    truth = (0.03, 0.05, 0.4, 0.007, 0.39)
+    table = v, _torque(v, truth), 1e-8 * np.eye(v.shape[1])[None]
+    fit, plain = fit_law(*table, np.array([0.4 / rows])), fit_law(*table)
+    assert np.all(np.isfinite(fit.value[0, index])) == stated
+    np.testing.assert_array_equal(fit.value[0, [0, 3, 5]], plain.value[0, [0, 3, 5]])
+    (text,) = describe(fit, ("theta1",), (True,))
+    assert ("breakaway not determined, Stribeck velocity not determined" in text) != stated
+    why = f"; {0.4 / rows:.2g} rad/s is less than a row from rest, so that its shape there is not seen; "
+    assert stated or why in text

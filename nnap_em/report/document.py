@@ -18,7 +18,7 @@ from ..effects.equations import UnknownTerm
 from ..fit.identifiability import identifiability, sentences
 from ..fit.identify import FrictionTable, Identified, parameter_table
 from ..fit.predict import Prediction, given_of, horizon_errors, horizons_of, predict
-from ..model.law import LAW_UNITS, PARAMETERS, describe, fit_law
+from ..model.law import LAW_UNITS, PARAMETERS, describe, fit_law, passed
 from .tables import INNER
 
 
@@ -124,9 +124,12 @@ def errors(predicted: Mapping[str, Prediction], sides: Mapping[str, Identified],
     }
 
 
-def friction_law(fitted: Identified, table: FrictionTable) -> list[dict[str, Any]]:
-    """The Stribeck law nearest to each learned map."""
-    system, law = fitted.model.system, fit_law(table.velocity, table.torque, table.cov)
+def friction_law(
+    fitted: Identified, table: FrictionTable, velocity: Float[np.ndarray, "sample dof"]
+) -> list[dict[str, Any]]:
+    """The Stribeck law nearest to each learned map, as far as `velocity` in all rows resolves it."""
+    system, fast = fitted.model.system, passed(velocity, np.asarray(table.velocity))
+    law = fit_law(table.velocity, table.torque, table.cov, fast)
     out = []
     for j, text in enumerate(describe(law, system.coordinates, system.angles)):
         numbers = zip(PARAMETERS, law.value[j].tolist(), law.std[j].tolist(), LAW_UNITS[system.angles[j]], strict=True)

@@ -54,7 +54,7 @@ def write_identification(
         velocities = _velocities(fitted, train, epochs)
         ranges = visited(fitted, velocities, train)
         table = friction_table(fitted, jnp.asarray(visited_nodes(velocities)))
-        laws = friction_law(fitted, table)
+        laws = friction_law(fitted, table, velocities)
         write_friction(out / "friction.csv", *map(np.asarray, (table.velocity, table.torque, table.std)))
         figures.append(_draw(out / "friction.png", fitted, table, velocities))
     bristles = contacts(fitted) if fitted.rig.memory else []

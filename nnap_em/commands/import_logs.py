@@ -20,13 +20,13 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from ..data.rig import read_rig, toml_text
+from ..data.rig import SMOOTH, read_rig, toml_text
 from ..import_.declared import read_plan
 from ..import_.folder import completed, places, write_sequences
 from ..import_.resample import Resampled, resample
 from ..numerics.digits import counted
 from ..report.document import versions
-from ..report.tables import write_json
+from ..report.tables import json_text
 from ..storage.files import replace_text, whole_folder
 from ..storage.log import Log
 from ..systems import specs
@@ -55,7 +55,7 @@ def run(args: argparse.Namespace, log: Log) -> None:
             "format": 1,
             "rig": rig.name,
             "dt": rig.dt,
-            "input": "mean" if plan.mean else "hold",
+            "input": "line" if rig.input_hold == SMOOTH else "mean" if plan.mean else "hold",
             "shifts": shifts,
             "rows_used": rows,
             "rows_dropped": sum(each["rows"] for each in entries) - rows,
@@ -64,7 +64,7 @@ def run(args: argparse.Namespace, log: Log) -> None:
             "seconds": time.perf_counter() - began,
             "versions": versions(),
         }
-        write_json(part / "import.json", document)
+        replace_text(part / "import.json", json_text(document))
     for line in document["look"]:
         log(f"warning: {line}")
     test = sum(file.startswith("test/") for file in files)

@@ -202,7 +202,7 @@ def functions(
             scaled, change = None if scale is None else state.u[drives:], fed - state.fed
             bend = jnp.where(state.age > 0.5 * model.dt, change - state.fed + state.past, 0.0)
             held = held._replace(u=state.fed, scale=scaled, course=jnp.stack([change, bend]))
-            here = here._replace(before=state.fed, course=0.0 * held.course)
+            here = here._replace(before=state.fed, course=jnp.zeros((2, drives), dtype))
         return _Row(
             first=first, u=u, memory=memory, y=jnp.where(read, y, 0.0), read=read & ~waits,
             late=jnp.where(read & waits, y, jnp.nan), gate=jnp.where(state.rows < SETTLING, jnp.inf, GATE),

@@ -146,6 +146,8 @@ def test_what_cannot_be_told_is_a_verdict():
     assert "cannot tell" in text and "dead zone at joint 2 and torsional spring at joint 1" in text
     assert len(advice([], rivals)) == 2
     assert "cannot tell" not in verdict([], None, 3)
+    late = verdict([], None, unfinished="The search was stopped")
+    assert late == "No effect was found yet. The search was stopped: more may be missing."
 
 
 def test_a_suspect_is_named_with_its_share_and_the_chance_level():

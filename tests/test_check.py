@@ -57,7 +57,18 @@ def _changed(logs: Logs, **parts) -> Logs:
 def test_a_good_data_set_is_all_ok(slide):
     report = _report(slide, test=slide)
     assert {mark for answers in report.values() for mark, _ in answers} == {"ok"}
-    assert list(report) == ["length", "test", "missing", "sampling", "noise", "torque", "dynamics", "motion", "states"]
+    assert list(report) == [
+        "length",
+        "test",
+        "missing",
+        "rate",
+        "sampling",
+        "noise",
+        "torque",
+        "dynamics",
+        "motion",
+        "states",
+    ]
     assert f"{COUNT} training sequences, 12.1 s, {COUNT * ROWS} rows" in report["length"][0][1]
     assert "2 of 2 directions" in report["states"][0][1]
 

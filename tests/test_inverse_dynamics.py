@@ -145,6 +145,51 @@ def test_a_zero_that_is_off_is_named_with_its_angle(log, degrees):
         assert float(named[1]) == pytest.approx(math.radians(degrees), abs=4e-3)
 
 
+SPREADS = {"m": 0.2, "lc": 0.5, "I": 0.1}
+K, R = 0.05, 0.4  # N m/A, ohm
+
+
+def _released(command: Callable[[float], float], drive: Callable[[float, np.ndarray], np.ndarray | float]) -> Log:
+    """A pendulum from 0.8 rad, under `drive` of its command and rate, with friction, in two recordings."""
+    n, fine = NUMBERS["pendulum"], 20
+    inertia, weight = n["I"] + n["m"] * n["lc"] ** 2, n["m"] * n["lc"] * n["g"]
+    q, v, rows = np.array([0.8, -1.2]), np.zeros(2), []
+    t = DT * np.arange(ROWS)
+    u = np.array([command(one) for one in t])
+    for k in range(ROWS):
+        rows.append(q)
+        for _ in range(fine):
+            friction = 0.02 * np.tanh(v / 0.05) + 0.005 * v
+            v = v + DT / fine * (drive(u[k], v) - weight * np.sin(q) - friction) / inertia
+            q = q + DT / fine * v
+    y = np.stack(rows, axis=1)[..., None] + np.random.default_rng(0).normal(0, 5e-4, (2, ROWS, 1))
+    both = lambda row: np.broadcast_to(row, (2, ROWS))  # noqa: E731
+    parameters = {key: Declared(value, SPREADS.get(key, 0.0) * value) for key, value in n.items()}
+    rig = Rig("log", "pendulum", parameters, True, ("u",), (1,), DT, "sequence", ("theta1",), {}, {})
+    return rig, Dataset(both(t), both(u)[..., None], y, np.ones((2, ROWS), bool))
+
+
+@pytest.mark.parametrize("size", [0.0, 0.5])
+def test_a_zero_that_is_upright_is_named_beside_uncertain_bodies(size):
+    """Swinging free, all numbers together have no scale; with half of `lc` uncertain it could have either sign."""
+    rig, data = _released(lambda t: size * np.sin(2 * np.pi * t), lambda u, v: u)
+    assert _warnings(rig, data) == []
+    (text,) = _warnings(rig, data._replace(y=data.y + np.pi))
+    assert re.match(r"theta1 reads (-?)3.1\d rad \(\1(1(79|8[01])\S*) degrees\) more", text)
+
+
+@pytest.mark.parametrize("brakes", [True, False])
+def test_a_drive_that_coasts_at_0_volts_is_named(brakes):
+    def drive(u, v):
+        return K * (u - K * v) / R if u or brakes else 0.0
+
+    rig, data = _released(lambda t: 8.0 * np.sin(5 * t) if t % 1.3 < 0.7 else 0.0, drive)
+    numbers = {"u.k": Declared(K, 0.0), "u.R": Declared(R, 0.0)}
+    rig = dataclasses.replace(rig, input_kinds=("voltage",), parameters={**rig.parameters, **numbers})
+    found = _warnings(rig, data)
+    assert [text[:57] for text in found] == ["u: at 0 V the drive does not brake, it coasts, and kind ="] * (not brakes)
+
+
 def test_swapped_inputs_are_named(log):
     rig, data = log
     found = _warnings(rig, data._replace(u=data.u[..., ::-1]))

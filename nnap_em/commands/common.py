@@ -25,7 +25,7 @@ from ..em.build import build_system, measure_scales
 from ..em.loop import FitError
 from ..experiment.limits import DesignError
 from ..export.model import ExportError
-from ..fit.check import ERROR, torques
+from ..fit.check import ERROR, WARNING, rates, torques
 from ..fit.known import differences
 from ..fit.predict import GIVEN
 from ..fit.store import AFTER_FILE, MODEL_FILE, Stored, fingerprint, model_file, read
@@ -48,6 +48,8 @@ class Halted(RuntimeError):
 MISTAKES = (RigError, DataError, StoreError, FitError, CompareError, DesignError, ExportError, Halted)
 WARNINGS = (RigWarning, DataWarning)
 REPORTS = ("report.json", "report.html")
+MISFIT_STATUS = 3
+"""Exit status of a fit that does not describe the motion."""
 UNFINISHED = "unfinished"
 """Folder of the finished steps of a run that is not."""
 OPTIONS = ("start", "smoother", "particles", "for", "seconds", "sequences", "seed")
@@ -185,15 +187,16 @@ def own_logs(args: argparse.Namespace, stored: Stored, log: Log) -> Dataset | No
 
 
 def warn_of_torques(folder: Path, bench: Bench) -> None:
-    """Warn where the inputs cannot be those of the declared bodies."""
+    """Warn where rates are not those of their coordinates, or inputs cannot be those of the declared bodies."""
     rig, data = bench.rig, bench.train.data
-    if rig.equations:
-        return
-    system = build_system(rig)
-    for finding in torques(rig, system, data, measure_scales(rig, system, data)):
+    found = list(rates(rig, data))
+    if not rig.equations:
+        system = build_system(rig)
+        found += torques(rig, system, data, measure_scales(rig, system, data))
+    for finding in found:
         if finding.mark == ERROR:
             warnings.warn(f"{folder / 'train'}: column {finding.text}", DataWarning, 2)
-        elif finding.subject in ("scale", "range"):
+        elif finding.subject in ("scale", "range") or (finding.subject, finding.mark) == ("rate", WARNING):
             warnings.warn(f"{folder / 'train'}: {finding.text}", DataWarning, 2)
 
 

@@ -13,7 +13,6 @@ from jaxtyping import Float
 
 from ..numerics.digits import counted
 from .counters import counter
-from .units import parameter_unit
 
 Columns = Mapping[str, Float[np.ndarray, " time"]]
 STRETCH = 20  # rows that two sequences do not have in common by chance
@@ -67,13 +66,10 @@ def implausible(
     inputs: Columns,
     readings: Columns,
     dt: float,
-    unit: Callable[[str], str] = parameter_unit,
-    pairs: Sequence[tuple[str, str]] | None = None,
+    unit: Callable[[str], str],
+    pairs: Sequence[tuple[str, str]],
 ) -> Iterator[Implausible]:
-    """Implausible parts of the columns of one sequence, sampled every `dt` [s].
-
-    `pairs` are the columns of coordinates and of their rates, where the names do not show it.
-    """
+    """Implausible parts of the columns of one sequence, sampled every `dt` [s]; `pairs` are coordinates and rates."""
     for name, values in readings.items():
         observed = values[np.isfinite(values)]
         if not observed.size:
@@ -86,9 +82,8 @@ def implausible(
         if unit(name) in ("rad", "m", "rad/s", "m/s"):
             yield from _wrapped(name, values, unit(name))
     yield from _copies(inputs, readings)
-    for name, rate in pairs if pairs is not None else [(name, f"d{name}") for name in readings]:
-        if name in readings and rate in readings:
-            yield from _pair(name, rate, {**inputs, **readings}, dt, unit(name) == "rad")
+    for name, rate in pairs:
+        yield from _pair(name, rate, {**inputs, **readings}, dt, unit(name) == "rad")
     fastest = 30.0  # rad/s, as the median speed of a joint
     for name, values in readings.items():
         rate = unit(name) == "rad/s"

@@ -178,15 +178,18 @@ class Rig:
             return not unpacked(self.machine).joints[joint].slide
         return not all(parameter_unit(name).startswith("m") for name in self.measured)
 
-    def pairs(self) -> list[tuple[str, str]] | None:
-        """Every coordinate with its rate, where names do not determine it: the rate of x is dx."""
-        states = unpacked(self.machine).states if self.machine else ()
-        dof = len(states) // 2
-        return list(zip(states[:dof], states[dof:], strict=True)) if states else None
+    def pairs(self) -> list[tuple[str, str]]:
+        """Measured coordinates with their measured rates, which the equations or names determine: that of x is dx."""
+        if self.equations:
+            of = json.loads(self.equations)
+            states = {of["readings"].get(column, column): column for column in self.measured}
+            return [(states[q], states[v]) for q, v in of["rates"].items() if q in states and v in states]
+        return [(name, f"d{name}") for name in self.measured if f"d{name}" in self.measured]
 
     def named(self, text: str) -> str:
         """`text` with the name that the machine's file gives a joint behind its number."""
-        return with_names(text, [coordinate for coordinate, _ in self.pairs() or ()])
+        states = unpacked(self.machine).states if self.machine else ()
+        return with_names(text, states[: len(states) // 2])
 
     def __str__(self) -> str:
         words = {name: "" if kind == TORQUE else f" ({kind})" for name, kind in self.kinds.items()}

@@ -29,6 +29,7 @@ from ..systems import AbstractSystem
 from .identifiability import identifiability, sentences
 from .identify import Identified, begin
 from .inverse_dynamics import UNEXPLAINED, Lag, explanations, gains, lag, mistakes, regression
+from .rates import bridged, timings
 from .stops import at_stops
 
 OK, WARNING, ERROR = "ok", "warning", "error"
@@ -94,6 +95,7 @@ def check(
     train, test = logs_of_arrays(train, rig), None if test is None else logs_of_arrays(test, rig)
     data = Dataset(*(np.asarray(part) for part in train.data))
     amount = [*_amount(rig, data, test), *_missing(train, rig), *_held(train, rig), *_rough(train)]
+    amount += rates(rig, data)
     if amount[0].mark == ERROR:
         return amount
     try:
@@ -273,6 +275,12 @@ def _noise(rig: Rig, model: StateSpaceModel, data: Dataset) -> Iterator[CheckRes
         yield CheckResult(mark, "noise", how + tame + wild + drowned)
 
 
+def rates(rig: Rig, data: Dataset) -> Iterator[CheckResult]:
+    """Each rate against the derivative of its coordinate, where both are read."""
+    for wrong, text in timings(rig, data):
+        yield CheckResult(_mark(wrong), "rate", text)
+
+
 def torques(rig: Rig, system: AbstractSystem, data: Dataset, scales: Scales) -> Iterator[CheckResult]:
     """The inputs against gravity and inertia of the declared bodies."""
     mass, gravity = _loads_along(rig, system, data)
@@ -322,12 +330,14 @@ def dynamics(rig: Rig, system: AbstractSystem, data: Dataset) -> Iterator[CheckR
         )
     elif np.all(plain < UNEXPLAINED):
         text = f"declared bodies and a static friction explain {explained(plain)} of the torque, by joint"
-        slopes, lags = gains(problem), [lag(problem, i) for i in range(len(rig.input_columns))]
-        columns = list(zip(rig.input_columns, slopes, lags, strict=True))
-        text += "".join(f"; {name}: slope {slope:.3g}, {when} rows late" for name, slope, when in columns)
+        slopes = zip(rig.input_columns, gains(problem), strict=True)
+        kinds = enumerate(rig.kinds.items())
+        lags = {name: lag(problem, i) for i, (name, kind) in kinds if kind == TORQUE}
+        late_by = {name: f", {when} rows late" for name, when in lags.items()}
+        text += "".join(f"; {name}: slope {slope:.3g}{late_by.get(name, '')}" for name, slope in slopes)
         yield CheckResult(OK, "dynamics", text)
         yield from (
-            CheckResult(WARNING, "hold", f"{name}: {late(rig, when)}") for name, _, when in columns if when.counts
+            CheckResult(WARNING, "hold", f"{name}: {late(rig, when)}") for name, when in lags.items() if when.counts
         )
 
 
@@ -481,18 +491,12 @@ def _velocity(
     if rate in rig.measured:
         return np.asarray(data.y)[..., rig.measured.index(rate)], ""
     if position in rig.measured:
-        y = np.stack([_bridged(row) for row in np.asarray(data.y)[..., rig.measured.index(position)]])
+        y = bridged(np.asarray(data.y)[..., rig.measured.index(position)])
         v = (y[:, LAG:] - y[:, :-LAG]) / (LAG * rig.dt)
         if np.isfinite(v).any():
             return v, ""
     x = along.x[..., len(model.system.coordinates) + joint]
     return np.where(np.isfinite(x), x, np.nan), " (never seen, by the declared model)"
-
-
-def _bridged(y: Float[np.ndarray, " time"]) -> Float[np.ndarray, " time"]:
-    """Readings with straight lines between them, so that there are some `LAG` rows apart wherever they are."""
-    k = np.flatnonzero(np.isfinite(y))
-    return np.interp(np.arange(y.size), k, y[k], left=np.nan, right=np.nan) if k.size else y
 
 
 def _turns(v: Float[np.ndarray, " time"], dead: float) -> int:

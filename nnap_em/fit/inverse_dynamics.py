@@ -18,12 +18,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
-from scipy.optimize import lsq_linear
+from scipy.optimize import least_squares
 
 from ..data.dataset import Dataset
 from ..data.noise import reading_noise
 from ..data.rig import HELD, SMOOTH, Rig
-from ..data.servo import TORQUE
+from ..em.scale import not_identifiable
+from ..em.servos import build_servos
+from ..model import hooks
 from ..systems import AbstractSystem
 
 WIDTH, ORDER = 7, 4
@@ -37,7 +39,9 @@ KNOTS = 13
 FILTERED_ROWS = 5 * KNOTS
 """Filtered rows below which nothing is concluded."""
 WITHIN = 3.0
-"""Standard deviations within which an uncertain number may move."""
+"""Standard deviations within which an uncertain number may move; masses, lengths and inertias remain positive."""
+PASSES = 6
+"""Evaluations of the torques in a fit of uncertain numbers: products of three of them bend."""
 SMALLEST_MISFIT = 5e-5
 """Share of the squared torque that may stay unexplained: 0.7 % of the torque, as a zero off by 0.4 degrees leaves."""
 LARGEST_REMAINDER = 0.25
@@ -107,6 +111,8 @@ class Motion(NamedTuple):
     a: Float[np.ndarray, "piece time dof"]
     torque: Float[np.ndarray, "piece time input"]
     """Generalised force of every input, mean over the intervals before and behind a row, as `TRIANGLE` [N m, or N]."""
+    coasting: Float[np.ndarray, "piece time input"]
+    """The same, but none where the command of a `voltage` drive is 0."""
     inertial: Float[np.ndarray, " tap"]
     """Filter of what holds an acceleration."""
     direct: Float[np.ndarray, "dof tap"]
@@ -121,6 +127,8 @@ class Regression(NamedTuple):
     mean: dict[str, Array]
     """Uncertain numbers of the machine."""
     std: Float[np.ndarray, " param"]
+    least: Float[np.ndarray, " param"]
+    """Smallest changes of these numbers [std]."""
     rows: Bool[np.ndarray, "piece time"]
     inputs: Float[np.ndarray, "row input"]
     friction: list[Float[np.ndarray, "row direction"]]
@@ -153,15 +161,23 @@ class Regression(NamedTuple):
     ) -> Float[np.ndarray, " dof"]:
         """Share of the squared torque that stays unexplained, by joint, with these changes of the log."""
         share = np.stack([np.ones_like(self.size), np.ones_like(self.size), gravity * np.ones_like(self.size)])
-        needed = np.einsum("pj,prj->rj", share, self.parts(sign, shift))
-        error = self.beyond(needed - self.applied(gains * self.inputs[:, order]))
-        if len(self.std):
-            slopes = np.einsum("pj,prjk->rjk", share, self.parts(sign, shift, slopes=True)) * self.std
-            columns = np.stack([self.beyond(slopes[..., k]) for k in range(len(self.std))], axis=-1)
-            both = np.concatenate([columns, error[..., None]], axis=-1).reshape(-1, len(self.std) + 1)
-            triangle = np.asarray(np.linalg.qr(both, mode="r"))
-            error = error - columns @ lsq_linear(triangle[:, :-1], triangle[:, -1], (-WITHIN, WITHIN)).x
-        return np.mean(error**2, axis=0)
+        applied = self.applied(gains * self.inputs[:, order])
+
+        def at(moved: np.ndarray) -> "Regression":
+            values = zip(self.mean.items(), moved * self.std, strict=True)
+            return self._replace(mean={name: mean + change for (name, mean), change in values})
+
+        def error(moved: np.ndarray) -> np.ndarray:
+            return self.beyond(np.einsum("pj,prj->rj", share, at(moved).parts(sign, shift)) - applied).ravel()
+
+        def slopes(moved: np.ndarray) -> np.ndarray:
+            columns = np.einsum("pj,prjk->krj", share, at(moved).parts(sign, shift, slopes=True))
+            return np.stack([self.beyond(one).ravel() for one in columns], axis=-1) * self.std
+
+        moved = np.zeros_like(self.std)
+        if len(moved):
+            moved = least_squares(error, moved, slopes, (self.least, WITHIN), max_nfev=PASSES).x  # pyright: ignore[reportArgumentType]
+        return np.mean(error(moved).reshape(-1, len(self.size)) ** 2, axis=0)
 
     def applied(self, inputs: Float[np.ndarray, "row input"]) -> Float[np.ndarray, "row dof"]:
         """Generalised force of the inputs."""
@@ -177,12 +193,22 @@ class Regression(NamedTuple):
 
 
 def motion_along(rig: Rig, system: AbstractSystem, data: Dataset) -> Motion | None:
-    """Motion along the logs; None where a coordinate is hardly read, or an input is no torque."""
+    """Motion along the logs; None where a coordinate is hardly read, or an input is neither a torque nor a voltage.
+
+    Numbers of a drive are as declared: the friction map takes up an error of its back-EMF.
+    """
     read, coordinates = rig.measured, list(zip(system.coordinates, system.rates, system.angles, strict=True))
     seen = all(name in read or (rate in read and not turns) for name, rate, turns in coordinates)
-    if not seen or any(kind != TORQUE for kind in rig.kinds.values()):
+    servos, valid = build_servos(rig), np.asarray(data.valid)
+    if not seen or rig.scale_columns or not {*rig.kinds.values()} <= {"torque", "voltage"}:
         return None
-    y, u = (_pieces(np.asarray(part, float), np.asarray(data.valid)) for part in (data.y, data.u))
+    fed = np.asarray(data.u, float)[..., : len(system.joints)]
+    still = fed == 0
+    if servos:
+        through = hooks.Sampling(rig.dt, rig.input_hold == SMOOTH).through
+        each = jax.vmap(lambda u: jnp.stack([of.fed(u[:, i], through) for i, of in enumerate(servos)], axis=-1))
+        fed = np.asarray(each(jnp.asarray(fed)))
+    y, u, still = (_pieces(np.asarray(part, float), valid) for part in (data.y, fed, still))
     value, slope, bend = (_derivative(order, rig.dt) for order in range(3))
     # an acceleration is the mean of the true one with these weights
     of_position, of_rate = np.cumsum(np.cumsum(bend))[:-2] * rig.dt**2, -np.cumsum(slope)[:-1] * rig.dt
@@ -216,9 +242,16 @@ def motion_along(rig: Rig, system: AbstractSystem, data: Dataset) -> Motion | No
     if low is None:
         return None
     edge = WIDTH // 2
-    torque = np.pad(filtered(u, np.array(TRIANGLE[rig.input_hold])), ((0, 0), (1, 1), (0, 0)), constant_values=np.nan)
-    torque = torque[:, edge:-edge, : len(system.joints)] * np.asarray(system.gears)
-    return Motion(q, v, a, torque, np.pad(low, edge), np.stack([np.convolve(low, window) for *_, window in sources]))
+    both = (filtered(part, np.array(TRIANGLE[rig.input_hold])) for part in (u, still))
+    torque, still = (np.pad(part, ((0, 0), (1, 1), (0, 0)), constant_values=np.nan)[:, edge:-edge] for part in both)
+    gears, coasting = np.asarray(system.gears), torque.copy()
+    for i, servo in enumerate(servos):
+        fed = torque[..., i], 0.0 * torque[..., i]
+        own = [jnp.asarray([gears[i] * x[..., system.joints[i] - 1]] * 2) for x in (q, v)]
+        driven, braking = np.asarray(jnp.vectorize(servo.torque)(jnp.asarray(fed), *own))
+        torque[..., i], coasting[..., i] = driven, driven - still[..., i] * braking * (servo.kind == "voltage")
+    direct = np.stack([np.convolve(low, window) for *_, window in sources])
+    return Motion(q, v, a, torque * gears, coasting * gears, np.pad(low, edge), direct)
 
 
 def regression(rig: Rig, system: AbstractSystem, data: Dataset) -> Regression | None:
@@ -226,13 +259,25 @@ def regression(rig: Rig, system: AbstractSystem, data: Dataset) -> Regression | 
     motion = motion_along(rig, system, data)
     if motion is None:
         return None
-    uncertain = {name: declared for name, declared in rig.parameters.items() if declared.std and name in rig.bodies}
+    held = not_identifiable(rig, system, data)
+    uncertain = {name: of for name, of in rig.parameters.items() if of.std and name in rig.bodies and name not in held}
     mean = {name: jnp.asarray(declared.mean, float) for name, declared in uncertain.items()}
+    positive = [of.mean > 0 and ("." not in n or n.endswith(("mass", "armature"))) for n, of in uncertain.items()]
+    both = zip(uncertain.values(), positive, strict=True)
+    least = [max(-WITHIN, -of.mean / of.std) if above else -WITHIN for of, above in both]
     inputs = _by_joint(motion.torque, motion.direct[[joint - 1 for joint in system.joints]])
     maps = [filtered(_hats(motion.v[..., j]), taps) for j, taps in enumerate(motion.direct)]
     full = np.ones(inputs.shape[:2], bool)
     problem = Regression(
-        system, motion, mean, np.asarray([d.std for d in uncertain.values()]), full, inputs, [], inputs
+        system,
+        motion,
+        mean,
+        np.asarray([d.std for d in uncertain.values()]),
+        np.asarray(least),
+        full,
+        inputs,
+        [],
+        inputs,
     )
     plain = problem.parts().reshape(3, *full.shape, -1)
     rows = np.all([np.isfinite(part).all(axis=-1) for part in (*plain, inputs, *maps)], axis=0)
@@ -246,6 +291,7 @@ def regression(rig: Rig, system: AbstractSystem, data: Dataset) -> Regression | 
 def explanations(rig: Rig, problem: Regression) -> Iterator[Explanation]:
     """Every mistake that a log may have, corrected."""
     yield from _gains(rig, problem)
+    yield from _coasting(rig, problem)
     yield from _swapped(rig, problem)
     yield from _weightless(rig, problem)
     yield from _mirrored(problem)
@@ -305,6 +351,19 @@ def _gains(rig: Rig, problem: Regression) -> Iterator[Explanation]:
             texts.append(f"{text}; or masses and lengths are not in kg and m")
     if texts:
         yield Explanation(problem.remains(gains=slopes), "; ".join(texts))
+
+
+def _coasting(rig: Rig, problem: Regression) -> Iterator[Explanation]:
+    """Voltage drives without back-EMF while their command is 0."""
+    motion = problem.motion
+    names = [name for i, name in enumerate(rig.input_columns) if np.any((motion.coasting != motion.torque)[..., i])]
+    if names:
+        text = (
+            f'{" and ".join(names)}: at 0 V the drive does not brake, it coasts, and kind = "voltage" has its back-EMF'
+        )
+        text += " there, too: set the driver to brake, or leave rows at 0 V out"
+        inputs = _by_joint(motion.coasting, motion.direct[[joint - 1 for joint in problem.system.joints]])[problem.rows]
+        yield Explanation(problem._replace(inputs=inputs).remains(), text, ruins=False)
 
 
 def _swapped(rig: Rig, problem: Regression) -> Iterator[Explanation]:

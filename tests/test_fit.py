@@ -166,6 +166,8 @@ WHOLE = [0.0, 90.0, 6.0, 6.0]
         ([*WHOLE, 5.0, 6.9], {"ess": 100.0}, 0.0),  # by chance, of a sample
         ([*WHOLE, 5.0, 7.1], {"ess": 100.0}, 1.1),
         (WHOLE, {}, np.inf),
+        (WHOLE[1:], {"epoch": 4}, np.inf),
+        ([*WHOLE[1:], 6.0], {"epoch": 5}, 0.0),  # begun from another fit, whose first epoch counts
     ],
 )
 def test_a_fit_that_its_epochs_end_has_the_rise_of_its_likelihood(loglik, changes, rise):
@@ -310,6 +312,17 @@ def test_recordings_that_disagree_and_forces_unsaid_widen_a_posterior_but_not_it
     spread = (disagree + shared) / (1.0 + slope**2 * weight.sum()) ** 2
     assert float(precision[-1, -1]) == pytest.approx(1.0 + 1.0 / (1.0 / likelihood + spread), rel=1e-6)
     assert 1.0 <= float(precision[-1, -1]) <= 1.0 + likelihood + 1e-9
+
+
+@pytest.mark.parametrize(("rows", "blocks"), [(24, 3), (7, 1)])
+def test_a_single_recording_counts_as_blocks_longer_than_its_errors_correlate(rows, blocks):
+    """Horizons of one and two starts, so that a block has eight of them; no score is lost."""
+    scores = np.random.default_rng(0).normal(size=(1, rows, 2))
+    cut = stated.clustered(scores, np.array([1.0, 2.0]))
+    assert cut.shape == (blocks, 2)
+    np.testing.assert_allclose(cut, [part.sum(axis=0) for part in np.array_split(scores[0], blocks)])
+    both = np.concatenate([scores, scores])
+    np.testing.assert_allclose(stated.clustered(both, np.array([1.0, 2.0])), both.sum(axis=1))
 
 
 def _left(rng, tau: float) -> stated.Errors:

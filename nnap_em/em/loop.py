@@ -283,7 +283,8 @@ def unsettled(state: EMState, schedule: Schedule, longest: int) -> float:
 
     Infinite where fewer than three epochs saw whole sequences. A sampled likelihood rises by more than it ever fell.
     """
-    whole = [value for epoch, value in enumerate(state.loglik) if schedule.horizon(epoch, longest) == longest]
+    epochs = range(state.epoch - len(state.loglik), state.epoch)  # a fit begun from another starts at 1
+    whole = [v for epoch, v in zip(epochs, state.loglik, strict=True) if schedule.horizon(epoch, longest) == longest]
     if len(whole) < 3:
         return math.inf
     # Least rise of the log-likelihood over two epochs by which EM is not at rest [nat a sequence]

@@ -61,11 +61,11 @@ def widened(
         H = P + (L^-1 + V)^-1,   V = A^-1 (n / (n - 1) sum_s g_s g_s' + tau^2 sum_k b_k b_k') A^-1
 
     with P the precision of the prior, P + L = `hessian`, g_s the multi-step score of recording s and A its information,
-    that of the prior with it; b_k is the score of the k-th of many smooth random forces of the state, and tau their
-    size, by the likelihood of the errors that are left. Nothing becomes less certain than the prior. [Huber 1967, Proc.
-    5th Berkeley Symp. 1, 221; Liang & Zeger 1986, Biometrika 73, 13, for clusters; Muller 2013, Econometrica 81, 1805,
-    for the prior; Kennedy & O'Hagan 2001, J. R. Stat. Soc. B 63, 425, for model discrepancy; Rahimi & Recht 2007, NIPS,
-    for the functions]
+    that of the prior with it; a single recording counts as its blocks; b_k is the score of the k-th of many smooth
+    random forces of the state, and tau their size, by the likelihood of the errors that are left. Nothing becomes less
+    certain than the prior. [Huber 1967, Proc. 5th Berkeley Symp. 1, 221; Liang & Zeger 1986, Biometrika 73, 13, for
+    clusters; Muller 2013, Econometrica 81, 1805, for the prior; Kennedy & O'Hagan 2001, J. R. Stat. Soc. B 63, 425, for
+    model discrepancy; Rahimi & Recht 2007, NIPS, for the functions]
     """
     weights = m_step.weights(model)
     other = discrepancy_columns(model, weights, path, data, used, key=key)
@@ -74,7 +74,8 @@ def widened(
     prior = np.asarray(weights.prior_precision(model.unknown))
     errors, scores = _rows(predictions, weighed(predictions, used), len(prior))
     information = prior + errors.own.T @ (errors.weight[:, None] * errors.own)
-    scores = scores[used] - scores[used].mean(axis=0)
+    scores = clustered(scores[used], predictions.overlap)
+    scores = scores - scores.mean(axis=0)
     count = len(scores)
     force = size(errors, information)
     shared = force * errors.own.T @ (errors.weight[:, None] * errors.other)
@@ -175,13 +176,27 @@ def size(errors: Errors, information: Float[np.ndarray, "column column"]) -> flo
     return math.sqrt(float(ratios[best, 0] * noise[best]))
 
 
+BLOCK = 4
+"""Longest horizons in a block of a single recording: errors correlate over one, and pieces of a recording that logs
+hold as sequences are longer."""
+
+
+def clustered(
+    scores: Float[np.ndarray, "seq start phi"], overlap: Float[np.ndarray, " horizon"]
+) -> Float[np.ndarray, "cluster phi"]:
+    """Scores of every recording, or of the blocks of a single one."""
+    if len(scores) > 1:
+        return scores.sum(axis=1)
+    return np.add.reduceat(scores[0], np.arange(0, scores.shape[1], max(1, round(BLOCK * float(overlap[-1])))))
+
+
 def _rows(
     predictions: OpenLoop, weight: Float[np.ndarray, "seq start horizon obs"], phi: int
-) -> tuple[Errors, Float[np.ndarray, "seq phi"]]:
-    """The errors in a row, and the score of every sequence."""
+) -> tuple[Errors, Float[np.ndarray, "seq start phi"]]:
+    """The errors in a row, and the score of every start."""
     columns = np.where(weight[..., None] > 0, predictions.columns, 0.0).astype(float)
     error = np.where(weight > 0, predictions.error, 0.0)
-    scores = np.einsum("skhoc,skho->sc", columns[..., :phi], weight * error)
+    scores = np.einsum("skhoc,skho->skc", columns[..., :phi], weight * error)
     flat = columns.reshape(-1, columns.shape[-1])
     count = float(np.sum((weight > 0) / predictions.overlap[:, None]))
     return Errors(error.ravel(), flat[:, :phi], flat[:, phi:], weight.ravel(), count), scores

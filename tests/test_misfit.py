@@ -12,11 +12,25 @@ from nnap_em.data.dataset import Dataset
 from nnap_em.data.rig import Declared, Rig
 from nnap_em.em.build import measure_scales
 from nnap_em.fit.identify import Identified, begin
-from nnap_em.fit.misfit import LEFT, PUSHED, UNPREDICTED, misfits, moved
+from nnap_em.fit.misfit import (
+    BEYOND_NOISE,
+    LEFT,
+    PUSHED,
+    UNMOVED,
+    UNPREDICTED,
+    Accuracy,
+    Moved,
+    ahead,
+    misfit,
+    moved,
+    simulating,
+)
+from nnap_em.fit.store import load, save
 from nnap_em.report import identification
 
-DT, ROWS = 0.02, 121
+DT, ROWS = 0.02, 201
 RIG = Rig("slide", "slide", {"m": Declared(1.0, 0.1)}, False, ("u",), (1,), DT, "sequence", ("x",), {"x": 0.01}, {})
+GOOD = Accuracy("x", "m", (0.25, 0.5, 1.0), (0.03, 0.04, 0.05), (0.2, 0.4, 0.6), 0.01, 0.3)
 
 
 def _data() -> Dataset:
@@ -30,53 +44,97 @@ def fitted() -> Identified:
     return begin(RIG, _data(), key=jax.random.key(0))
 
 
-def _pushed(fitted: Identified, share: float) -> Identified:
-    """The fit with random accelerations of this share of the motion's."""
-    size = measure_scales(RIG, fitted.model.system, _data()).acceleration
-    log_q = fitted.model.log_q.at[1:].set(2 * jnp.log(share * DT * size))
-    return fitted._replace(state=fitted.state._replace(best=eqx.tree_at(lambda m: m.log_q, fitted.model, log_q)))
-
-
-def _error(share: float) -> dict:
-    """An error over 1 s of this share of the motion in that time."""
-    y = _data().y[:, 51:101, 0]
-    size = float(np.sqrt(np.mean((y - y.mean(axis=1, keepdims=True)) ** 2)))
-    return {"horizons_s": [0.5, 1.0], "fit": {"x": [0.0, share * size]}}
-
-
 @pytest.mark.parametrize(
-    ("push", "error", "said"),
+    ("changes", "useless"),
     [
-        (1.01 * PUSHED, None, True),
-        (0.99 * PUSHED, None, False),
-        (1.01 * PUSHED, 1.01 * UNPREDICTED, True),
-        (1.01 * PUSHED, 0.99 * UNPREDICTED, False),  # it predicts all the same
+        ({"pushed": 1.01 * PUSHED, "error": (0.01, 0.01, 1.01 * UNPREDICTED * 0.6)}, True),
+        ({"pushed": 0.99 * PUSHED, "error": (0.01, 0.01, 1.01 * UNPREDICTED * 0.6)}, False),
+        ({"pushed": 1.01 * PUSHED, "error": (0.01, 0.01, 0.99 * UNPREDICTED * 0.6)}, False),  # it predicts all the same
+        ({"error": (1.01 * UNMOVED * 0.2, 5.0, 5.0)}, True),
+        ({"error": (0.99 * UNMOVED * 0.2, 5.0, 5.0)}, False),  # of a chaotic motion the first moments alone
+        ({"seconds": (), "error": (1.01 * UNMOVED * 0.2,), "motion": (0.2,)}, True),
+        ({"seconds": (), "error": (0.99 * UNMOVED * 0.2,), "motion": (0.2,)}, False),
     ],
 )
-def test_a_motion_that_is_taken_for_random_and_not_predicted_is_said(fitted, push, error, said):
-    test = None if error is None else _data()
-    found = misfits(_pushed(fitted, push), _data(), None if error is None else _error(error), test)
-    assert [one.name for one in found] == ["x"] * said
-    assert all("random forces accelerate x by" in one.sentence and "m/s^2" in one.sentence for one in found)
+def test_a_fit_that_predicts_nothing_or_takes_motion_for_random_is_useless(changes, useless):
+    word = misfit([GOOD, GOOD._replace(column="y", **changes)])
+    assert word.useless == useless
+    assert ("do not use it: y errs by " in word.text) == useless
+    assert word.document["readings"][1]["column"] == "y"
+
+
+@pytest.mark.parametrize(("noises", "named"), [(1.01 * BEYOND_NOISE, True), (0.99 * BEYOND_NOISE, False)])
+def test_errors_far_beyond_the_noise_have_their_size_and_change_no_exit_status(noises, named):
+    word = misfit([GOOD, GOOD._replace(column="y", error=(noises * 0.01, 0.2, 0.3))])
+    assert not word.useless
+    first = (
+        "Something is missing in the model: y errs by 0.3 m 1 s ahead, 50 % of its motion; 0.25 s ahead by 0.101, 10"
+    )
+    assert word.text.startswith(first) if named else word.text == ""
+
+
+def test_a_fit_that_has_not_come_to_rest_is_not_judged_by_its_random_forces():
+    row = GOOD._replace(pushed=2.0, error=(0.01, 0.1, 0.5))
+    assert misfit([row]).useless and not misfit([row], settled=False).useless
+    assert misfit([]) == ("", False, ())
+
+
+def test_accuracy_has_the_errors_beside_the_change_of_the_reading(fitted):
+    """A sine of 3 rad/s over h: the mean square of its change is amplitude^2 (1 - cos 3 h)."""
+    data, share = _data(), 0.7
+    size = measure_scales(RIG, fitted.model.system, data).acceleration
+    model = eqx.tree_at(lambda m: m.log_q, fitted.model, fitted.model.log_q.at[1:].set(2 * jnp.log(share * DT * size)))
+    error = np.full((2, 5, 3, 1), 0.02)
+    error[:, 1:3] = np.nan
+    (row,) = ahead(RIG, model, error, data)
+    assert (row.column, row.unit, row.pushed) == ("x", "m", pytest.approx(share))
+    np.testing.assert_allclose(row.seconds, [0.26, 0.5, 1.0], atol=0.02)
+    np.testing.assert_allclose(row.motion, 0.3 * np.sqrt(1 - np.cos(3 * np.array(row.seconds))), rtol=0.15)
+    np.testing.assert_allclose(row.error, 0.02)
+    assert row.noise == pytest.approx(float(np.exp(0.5 * model.log_r[0])))
+    loud = data._replace(y=data.y + np.random.default_rng(0).normal(0, 0.05, data.y.shape))
+    assert ahead(RIG, model, error, loud)[0].noise == pytest.approx(0.05, rel=0.1)
+    assert ahead(RIG, model, np.full(error.shape, np.nan), data) == ()
+
+
+def test_accuracy_of_free_simulations_is_beside_the_spread_of_the_reading(fitted):
+    (row,) = simulating(RIG, fitted.model, np.full((2, 3, 4, 1), -0.1), _data())
+    assert row.seconds == () and row.error == (pytest.approx(0.1),)
+    assert row.motion == (pytest.approx(0.3 / np.sqrt(2), rel=0.05),)
+    assert misfit(simulating(RIG, fitted.model, np.full((2, 3, 4, 1), np.inf), _data())).useless
+
+
+def test_the_word_is_kept_with_the_model_and_printed(fitted, tmp_path):
+    far = fitted._replace(accuracy=(GOOD._replace(error=(0.5, 0.5, 0.5)),))
+    save(tmp_path / "model.npz", far)
+    there = load(tmp_path / "model.npz")
+    assert there.misfit == far.misfit and far.misfit.text and far.misfit.text in str(there)
+
+
+def _moved(fitted: Identified) -> list[Moved]:
+    return moved(fitted.rig, fitted.m_step.prior, fitted.model)
 
 
 @pytest.mark.parametrize(("distance", "said"), [(1.01 * LEFT, True), (-1.01 * LEFT, True), (0.99 * LEFT, False)])
 def test_a_number_far_from_its_declaration_is_said_with_its_meaning(fitted, distance, said):
     model = fitted.m_step.prior.write(fitted.model, jnp.asarray([distance]))
     there = fitted._replace(state=fitted.state._replace(best=model))
-    sentences = [one.sentence for one in moved(there)]
+    sentences = [one.sentence for one in _moved(there)]
     assert [text.partition(" kg is 3.0 std from what is declared (1): ")[::2] for text in sentences] == [
         (f"m = {1 + 0.1 * distance:.4g}", "something is missing in the model, or rig.toml is wrong.")
     ] * said
-    assert identification._verdict(there, 2, 0).endswith(" ".join(sentences) or "in 0 epochs.")
+    assert identification._verdict(there, 2, 0, far=_moved(there)).endswith(" ".join(sentences) or "in 0 epochs.")
 
 
 def test_a_trusted_number_cannot_move():
     trusted = dataclasses.replace(RIG, parameters={"m": Declared(1.0, 0.0)})
-    assert moved(begin(trusted, _data(), key=jax.random.key(0))) == []
+    assert _moved(begin(trusted, _data(), key=jax.random.key(0))) == []
 
 
 def test_the_first_sentence_of_a_fit_says_that_it_does_not_describe_the_motion(fitted):
-    text = identification._verdict(fitted, 2, 0, ["u has the wrong sign"])
-    first = "The fit does not describe the motion, do not use it: u has the wrong sign. Fitted m to 2 sequences"
-    assert text.startswith(first)
+    useless = fitted._replace(accuracy=(GOOD._replace(error=(1.0, 1.0, 1.0)),))
+    text = identification._verdict(useless, 2, 0, ["u has the wrong sign"])
+    assert text.startswith("The fit does not describe the motion, do not use it: x errs by 1 m 1 s ahead, ")
+    assert "% of its acceleration. u has the wrong sign. Fitted m to 2 sequences" in text
+    far = identification._verdict(fitted._replace(accuracy=(GOOD._replace(error=(0.15, 0.2, 0.2)),)), 2, 0)
+    assert far.startswith("Fitted m to 2 sequences in 0 epochs. Something is missing in the model: x errs by")

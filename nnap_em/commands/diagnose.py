@@ -8,7 +8,7 @@ examples:
 
 Fits the declared unknowns, finds what the model lacks, adds it and fits again.  OUT gets report.html (read this one),
 report.json, before.npz and after.npz (for nnap-em predict and smooth) and friction tables of both.
-test/ serves for the reported errors only.
+test/ serves for the reported errors only.  Exit status 3 where even the last model does not describe the motion.
 """
 
 import argparse
@@ -22,10 +22,21 @@ from ..diagnosis.search import diagnose
 from ..fit.store import AFTER_FILE, fingerprint, save
 from ..report.diagnosis import write_diagnosis
 from ..storage.log import Log
-from .common import check_out, go_on, logs_at, origin, own_logs, read_bench, remove_reports, resumable, warn_of_torques
+from .common import (
+    MISFIT_STATUS,
+    check_out,
+    go_on,
+    logs_at,
+    origin,
+    own_logs,
+    read_bench,
+    remove_reports,
+    resumable,
+    warn_of_torques,
+)
 
 
-def run(args: argparse.Namespace, log: Log) -> None:
+def run(args: argparse.Namespace, log: Log) -> int:
     """Find it, and report; the test logs serve for the reported errors alone."""
     began = time.perf_counter()
     # Share of the minutes given after which the search begins no new step. The fit of the last law over the whole
@@ -56,9 +67,12 @@ def run(args: argparse.Namespace, log: Log) -> None:
         notes = {"settings": {"seed": args.seed}, "logs": logs_at(args)}
         for name, fitted in (("before.npz", diagnosis.before), (AFTER_FILE, diagnosis.after)):
             save(args.out / name, fitted, fingerprint=mark, notes=notes)
-        write_diagnosis(args.out, diagnosis, accepted, bench.train, bench.test, seed=args.seed, began=began, log=report)
+        described = write_diagnosis(
+            args.out, diagnosis, accepted, bench.train, bench.test, seed=args.seed, began=began, log=report
+        )
     if journal.open:
         log(go_on(args, journal))
+    return 0 if described else MISFIT_STATUS
 
 
 def _clock(seconds: float) -> str:

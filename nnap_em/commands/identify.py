@@ -31,10 +31,7 @@ from ..fit.store import MODEL_FILE, fingerprint, save
 from ..report.identification import write_identification
 from ..storage.log import Log
 from .cli import SMOOTHERS
-from .common import check_out, logs_at, origin, read_bench, remove_reports, resumable, warn_of_torques
-
-MISFIT_STATUS = 3
-"""Exit status of a fit that does not describe the motion."""
+from .common import MISFIT_STATUS, check_out, logs_at, origin, read_bench, remove_reports, resumable, warn_of_torques
 
 
 def run(args: argparse.Namespace, log: Log) -> int:

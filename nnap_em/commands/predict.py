@@ -5,7 +5,8 @@ examples:
   nnap-em predict fit/model.npz bench/test --given 2.0 --out prediction --seed 3
 
 Uses the readings up to the given time after a sequence's first row, and all inputs.  DIR gets a CSV file per sequence:
-time, all states, and their standard deviations without measurement noise.
+time, all states, and their standard deviations without measurement noise.  Exit status 3, and a line, where the fit
+does not describe its motion.
 """
 
 import argparse
@@ -20,10 +21,10 @@ from ..fit.predict import given_samples, predict
 from ..fit.store import load, model_file
 from ..numerics.digits import counted
 from ..storage.log import Log
-from .common import write_states
+from .common import MISFIT_STATUS, write_states
 
 
-def run(args: argparse.Namespace, log: Log) -> None:
+def run(args: argparse.Namespace, log: Log) -> int:
     """Write the distribution of every state after the readings up to the given time."""
     fitted = load(model_file(args.model))
     logs = read_logs(args.folder, fitted.rig, trust=args.trust_readings, until=args.given)
@@ -35,3 +36,6 @@ def run(args: argparse.Namespace, log: Log) -> None:
     mean, std = np.asarray(prediction.mean), np.asarray(prediction.std)
     write_states(args.out, logs, fitted.model.system.readable, mean, std)
     log(f"wrote {counted(len(logs.files), 'file')} to {args.out}")
+    if fitted.misfit.text:
+        log(fitted.misfit.text)
+    return MISFIT_STATUS if fitted.misfit.useless else 0

@@ -80,7 +80,7 @@ def grid_of(dt: float, rows: int, horizons: tuple[float, ...] = HORIZONS, pace: 
 
 def starts(model: StateSpaceModel, data: Dataset, horizons: tuple[float, ...] = HORIZONS) -> Int[np.ndarray, " start"]:
     """Rows of all sequences at which a prediction begins."""
-    return _grid(model, data, horizons).starts(data.t.shape[1])
+    return grid_along(model, data, horizons).starts(data.t.shape[1])
 
 
 def channels(model: StateSpaceModel) -> tuple[int, ...]:
@@ -119,7 +119,7 @@ def open_loop(
 ) -> OpenLoop:
     """Multi-step errors, or `error` where it is known, and their derivatives; `extra` gives columns by sequences."""
     (rows, obs), ports = along.data.y.shape[1:], len(along.model.system.ports)
-    grid, see, out = _grid(along.model, along.data, horizons), channels(along.model), []
+    grid, see, out = grid_along(along.model, along.data, horizons), channels(along.model), []
     none = lambda indices: Columns(*(jnp.zeros((indices.size, 0, rows, n)) for n in (ports, obs)))  # noqa: E731
     for indices, part in batches(len(along.state), along.linear, along.gain, along.middle):
         every = each(_sensitivities, (weights.nodes, grid), (*part, (extra or none)(indices)), together=1)
@@ -132,14 +132,15 @@ def errors(
     along: Followed, horizons: tuple[float, ...] = HORIZONS, see: tuple[int, ...] = ()
 ) -> Float[np.ndarray, "seq start horizon obs"]:
     """The errors alone [rad, or m], of the readings `see` or those that are compared; NaN where there is none."""
-    grid, rows = _grid(along.model, along.data, horizons), along.state.shape[1]
+    grid, rows = grid_along(along.model, along.data, horizons), along.state.shape[1]
     ages = np.pad(grid.ages, (0, max(0, len(HORIZONS + SHORT_HORIZONS) - len(grid.ages))), mode="edge")
     numbers = along.model, jnp.arange(grid.stride, rows, grid.stride), jnp.asarray(ages)  # one program for all horizons
     error = np.asarray(each(_errors, numbers, (along.state, along.linear.seq)))
     return error[:, : len(grid.starts(rows)), : len(grid.ages), see or channels(along.model)]
 
 
-def _grid(model: StateSpaceModel, data: Dataset, horizons: tuple[float, ...] = HORIZONS) -> Grid:
+def grid_along(model: StateSpaceModel, data: Dataset, horizons: tuple[float, ...] = HORIZONS) -> Grid:
+    """Starts and horizons on logs for predictions of a model."""
     return grid_of(model.dt, int(np.median(np.sum(np.asarray(data.valid), axis=1))), horizons, model.pace)
 
 

@@ -42,6 +42,7 @@ from ..numerics.profile import stage
 from ..smoother.gaussian import CubatureSmoother
 from ..smoother.posterior import AbstractSmoother
 from ..smoother.start import StartBank
+from .misfit import Misfit, ahead, misfit, simulating
 
 MakeSmoother = Callable[[StartBank], AbstractSmoother]
 Watch = Callable[[EMState, int, Bool[np.ndarray, " seq"]], None]
@@ -69,6 +70,8 @@ class Identified(NamedTuple):
     """Sentence on fits by likelihood and by errors over the horizon of use; of equations alone."""
     rise: float = 0.0
     """Rise of the log-likelihood at the end of EM (`loop.unsettled`) [nat a sequence]: more epochs would go on."""
+    accuracy: tuple[tuple, ...] = ()
+    """Errors of predictions along the training logs, beside motion and noise: `misfit.Accuracy` of every reading."""
 
     @property
     def model(self) -> StateSpaceModel:
@@ -80,11 +83,17 @@ class Identified(NamedTuple):
         """True where EM came to rest; `state.stop` is the reason for its end."""
         return self.state.stop == RESTED
 
+    @property
+    def misfit(self) -> Misfit:
+        """The word on how well the fit describes the motion; random forces count once EM is at rest."""
+        return misfit(self.accuracy, settled=not self.rise)
+
     def __str__(self) -> str:
         estimated = {name: Declared(*pair) for name, pair in parameter_table(self).items()}
         stop = f" ({self.state.stop}), {np.nanmean(self.state.top):.6g} nat a sequence" if self.state.stop else ""
         lines = [f"Identified {self.rig.name!r} after {counted(self.state.epoch, 'epoch')}{stop}"]
         lines += [f"estimated: {quantities(estimated, self.rig.unit)}"] if estimated else []
+        lines += [self.misfit.text] * bool(self.misfit.text)
         return "\n  ".join([*lines, *self.memory.splitlines(), str(self.model)])
 
 
@@ -161,32 +170,34 @@ PARTS_LEFT_OUT = 2
 def finished(fitted: Identified, data: Dataset) -> Identified:
     """`fitted`, its numbers finished on multi-step errors where that predicts sequences left out better.
 
-    Where it does not and the noise of the readings is that of the model, one-step likelihood is efficient, and its
-    curvature is its precision.  Equations are always fitted to errors over their horizon of use.
+    Where it does not, or there is one sequence alone, and the noise of the readings is that of the model, one-step
+    likelihood is efficient, and its curvature is its precision.  Equations are always fitted to errors over their
+    horizon of use.
     """
     data = jax.device_put(data)
     if fitted.model.system.simulated:
         return _simulating(fitted, data)
     posterior = e_step(fitted.model, data, fitted.smoother.tolerant(), key=fitted.state.key)
     path, used = posterior.state, np.asarray(not_diverged(posterior, data))
-    if used.sum() < PARTS_LEFT_OUT:
-        return fitted
+    parts = PARTS_LEFT_OUT if used.sum() >= PARTS_LEFT_OUT else 0
     part = np.where(used, np.cumsum(used) % PARTS_LEFT_OUT, -1)
-    before, falls = errors(followed(fitted.model, fitted.m_step.prior, path, data), JUDGED), []
-    for out in range(PARTS_LEFT_OUT):
+    before, falls = errors(along := followed(fitted.model, fitted.m_step.prior, path, data), JUDGED), []
+    for out in range(parts):
         trial = finish(fitted.model, fitted.m_step, path, data, used & (part != out), shaped=True)
         falls.append(ratio(before, errors(trial, JUDGED), part == out))
-    if np.mean(falls) < 1 - LEAST_FALL:
-        model = finish(fitted.model, fitted.m_step, path, data, used, shaped=True).model
+    if falls and np.mean(falls) < 1 - LEAST_FALL:
+        along = finish(fitted.model, fitted.m_step, path, data, used, shaped=True)
+        model, before = along.model, errors(along, JUDGED)
         posterior = e_step(model, data, fitted.smoother.tolerant(), key=fitted.state.key)
         _, info = fitted.m_step(model, posterior, data)  # a curvature belongs to the weights at which it was taken
         top = np.where(np.asarray(info.used), np.asarray(posterior.loglik), np.nan)
         fitted = fitted._replace(state=fitted.state._replace(best=model, hessian=info.hessian, top=top))
     elif white_readings(data, fitted.model):
-        return fitted
+        return fitted._replace(accuracy=ahead(fitted.rig, along.model, before, data))
     problem = fitted.model, fitted.m_step, path, data, used, fitted.state.hessian
     stated = widened(*problem, key=jax.random.fold_in(fitted.state.key, WIDENED))
-    return fitted._replace(state=fitted.state._replace(hessian=stated.hessian), discrepancy=stated.discrepancy)
+    state, errs = fitted.state._replace(hessian=stated.hessian), ahead(fitted.rig, along.model, before, data)
+    return fitted._replace(state=state, discrepancy=stated.discrepancy, accuracy=errs)
 
 
 def _simulating(fitted: Identified, data: Dataset) -> Identified:
@@ -221,7 +232,7 @@ def fitted_to_horizon(fitted: Identified, data: Dataset) -> Identified:
     best = simulated.fit(cast(StateSpaceModel, state.best), prior, data)
     hessian = jnp.asarray(simulated.precision(best))
     state = fitted.state._replace(best=best.model, model=best.model, proposal=best.model, hessian=hessian)
-    return fitted._replace(state=state)
+    return fitted._replace(state=state, accuracy=simulating(fitted.rig, best.model, best.error, data))
 
 
 def _horizon_note(fitted: Identified, likely: simulated.Simulated, best: simulated.Simulated) -> str:

@@ -38,8 +38,11 @@ def write_diagnosis(
     seed: int,
     began: float,
     log: Log,
-) -> None:
-    """Write the report of a diagnosis into the folder `out`; `began` is `time.perf_counter()` at the start."""
+) -> bool:
+    """Write the report of a diagnosis into the folder `out`; `began` is `time.perf_counter()` at the start.
+
+    True where the model with all that was found describes the motion.
+    """
     names, both = names_of(diagnosis.before), {"before": diagnosis.before, "after": diagnosis.after}
     sides = both if accepted else {"before": diagnosis.before}
     predicted = predictions(sides, train, test, seed) if test else {}
@@ -65,13 +68,15 @@ def write_diagnosis(
     ]
     rivals, suspects = undecided(diagnosis), suspected(diagnosis)
     failed = sum(t.p_value < 0.01 and not t.slight for t in tested["before"])
-    outcome, far = verdict(accepted, error, failed, rivals, suspects, diagnosis.unfinished), moved(diagnosis.after)
+    outcome, after = verdict(accepted, error, failed, rivals, suspects, diagnosis.unfinished), diagnosis.after
+    far, misfit = moved(after.rig, after.m_step.prior, after.model), after.misfit
     if diagnosis.change:
         outcome, far = changes(diagnosis, accepted, error), []
     command = "nnap-em design FIT --out NEXT, FIT this folder: the most informative inputs, ready to be played."
     designed = [command] if diagnosis.before.rig.input_columns and not diagnosis.before.rig.equations else []
     document = shared(diagnosis.before, train, test, seed=seed, began=began) | {
-        "verdict": " ".join([outcome, *(one.sentence for one in far)]),
+        "verdict": " ".join([outcome, *[misfit.text] * bool(misfit.text), *(one.sentence for one in far)]),
+        "misfit": {name: fitted.misfit.document for name, fitted in both.items()},
         "moved": far,
         "complete": diagnosis.complete,
         "since_fit": {"risen": diagnosis.risen} if diagnosis.change else None,
@@ -92,6 +97,7 @@ def write_diagnosis(
     write_page(out, document, figures, diagnosis.before.rig.named)
     log(document["verdict"])
     log(f"wrote {out / 'report.html'} and report.json")
+    return not misfit.useless
 
 
 def _error_pictures(

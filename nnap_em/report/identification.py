@@ -17,7 +17,7 @@ from ..em.build import build_system
 from ..em.loop import STEP_REFUSED
 from ..fit.check import dynamics
 from ..fit.identify import FrictionTable, Identified, friction_table
-from ..fit.misfit import misfits, moved
+from ..fit.misfit import Moved, moved
 from ..fit.predict import posterior_of
 from ..numerics.digits import counted
 from ..numerics.profile import stage
@@ -72,15 +72,14 @@ def write_identification(
     if error:
         caption = "On test sequences that the fit has not seen."
         figures.append(picture("error", "Prediction error", caption, error_figure(error, names)))
-    misfit = [one.sentence for one in misfits(fitted, train.data, error, test.data if test else None)]
-    if misfit:
-        causes = dynamics(fitted.rig, build_system(fitted.rig), train.data)
-        misfit += [cause.text for cause in causes if cause.mark != "ok"]
+    misfit, causes, far = fitted.misfit, [], moved(fitted.rig, fitted.m_step.prior, fitted.model)
+    if misfit.useless and not fitted.rig.equations:
+        causes = [one.text for one in dynamics(fitted.rig, build_system(fitted.rig), train.data) if one.mark != "ok"]
     entries = [{**epoch, "left_out": [train.files[i] for i in epoch["left_out"]]} for epoch in epochs]
     document = shared(fitted, train, test, seed=seed, began=began) | {
-        "verdict": _verdict(fitted, len(train.files), len(entries[-1]["left_out"]), misfit),
-        "misfit": misfit,
-        "moved": moved(fitted),
+        "verdict": _verdict(fitted, len(train.files), len(entries[-1]["left_out"]), causes, far),
+        "misfit": misfit.document,
+        "moved": far,
         "fit": error and {name: error[name] for name in ("given_s", "horizons_s")} | error["fit"],
         "error": error,
         "noise": noise(fitted),
@@ -102,10 +101,12 @@ def write_identification(
     _log_summary(document, log)
     write_page(out, document, figures, fitted.rig.named)
     log(f"wrote {out / 'report.json'}" + ("" if test else f" ({document['error_note']})"))
-    return not misfit
+    return not misfit.useless
 
 
-def _verdict(fitted: Identified, sequences: int, diverged: int, misfit: Sequence[str] = ()) -> str:
+def _verdict(
+    fitted: Identified, sequences: int, diverged: int, causes: Sequence[str] = (), far: Sequence[Moved] = ()
+) -> str:
     """The outcome of a fit: first, where it does not describe the motion, that; last numbers that left the rig's."""
     dof = len(fitted.model.system.coordinates)
     friction = [f"the friction of {counted(dof, 'joint')}"] * fitted.rig.friction
@@ -114,9 +115,10 @@ def _verdict(fitted: Identified, sequences: int, diverged: int, misfit: Sequence
     early, rested = _stopped_early(fitted), f" in {counted(fitted.state.epoch, 'epoch')}"
     rested += f", until {fitted.state.stop}" * (fitted.state.stop == STEP_REFUSED)
     text = f"Fitted {estimated} to {used}{f'; {early}' if early else rested}."
-    first = [f"The fit does not describe the motion, do not use it: {'; '.join(misfit)}."] * bool(misfit)
+    first, after = [fitted.misfit.text] * bool(fitted.misfit.text), [f"{'; '.join(causes)}."] * bool(causes)
+    first, last = (first, []) if fitted.misfit.useless else ([], first)
     notes = [sentence(fitted.horizon_note)] * bool(fitted.horizon_note)
-    return " ".join([*first, text, *notes, *(one.sentence for one in moved(fitted))])
+    return " ".join([*first, *after, text, *last, *notes, *(one.sentence for one in far)])
 
 
 def _stopped_early(fitted: Identified) -> str:
@@ -129,7 +131,7 @@ def _stopped_early(fitted: Identified) -> str:
 
 
 def _log_summary(document: dict[str, Any], log: Log) -> None:
-    if document["misfit"] or document["moved"]:
+    if document["misfit"]["text"] or document["moved"]:
         log(document["verdict"])
     for law in document["friction_law"] or []:
         log(law["text"])

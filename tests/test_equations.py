@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.integrate
 import scipy.linalg
 import scipy.optimize
 
@@ -19,8 +20,10 @@ from nnap_em.data.rig import RigError, read_rig, write_rig
 from nnap_em.effects import catalogue
 from nnap_em.em import simulated
 from nnap_em.em.build import build_system
-from nnap_em.em.equations import motion
-from nnap_em.fit.identify import begin, identify
+from nnap_em.em.equations import Motion, _modes, motion, pace_of
+from nnap_em.fit import identify as identification
+from nnap_em.fit.check import check
+from nnap_em.fit.identify import begin, identify, parameter_table
 from nnap_em.fit.store import load, save
 from nnap_em.model.hooks import reaching
 from nnap_em.model.state_space import Inputs
@@ -181,6 +184,144 @@ def test_time_constants_are_those_of_the_eigenvalues(tmp_path):
     np.testing.assert_allclose([seen.slowest, seen.fastest], [4.0, 0.5], rtol=1e-9)
 
 
+UNSTABLE, DOUBLE = np.array([[0.0, 6.0], [6.0, 0.0]]), np.array([[0.0, 1.0], [0.0, 0.0]])
+
+
+@pytest.mark.parametrize(
+    ("rate", "expected"),
+    [
+        (UNSTABLE, {"growth": 6.0, "unstable": ("a", "b")}),
+        (np.array([[-3.0, 0.0], [1.0, 0.4]]), {"growth": 0.4, "unstable": ("b",)}),
+        (np.array([[-3.0, 0.0], [1.0, 0.1]]), {"kept": ()}),  # grows by e^1 in half of the recording
+        (np.array([[0.0, 1.0], [-9.0, -0.2]]), {"kept": ()}),
+        (np.array([[0.0, 1.0], [-9.0, 0.0]]), {"kept": ()}),
+        (DOUBLE, {"kept": ("a", "b")}),
+        (np.array([[-3.0, 0.0], [1.0, 0.0]]), {"kept": ("b",)}),
+    ],
+)
+def test_unstable_modes_and_integrators_are_those_of_the_eigenvalues(rate, expected):
+    dt, rows = 0.05, 400
+    step = np.broadcast_to(scipy.linalg.expm(dt * rate), (2, rows, 2, 2))
+    found = _modes(("a", "b"), step, dt)
+    assert set(found) == set(expected)
+    for name, value in expected.items():
+        assert found[name] == (pytest.approx(value, rel=1e-3) if name == "growth" else value)
+
+
+def test_predictions_of_an_unstable_plant_end_when_errors_have_grown_e_fold(tmp_path):
+    rig = _rig(tmp_path)
+    none = np.zeros((0, 2))
+    seen = Motion(none, none, none, 1.0, 4.0)
+    assert pace_of(rig, seen, 1000) == 32.0
+    assert pace_of(rig, seen._replace(growth=0.2), 1000) == 5.0
+    assert pace_of(rig, seen._replace(growth=2.0), 1000) == 2.0  # four rows
+    assert pace_of(dataclasses.replace(rig, horizon=9.0), seen._replace(growth=0.2), 1000) == 9.0
+
+
+BALANCED = """[model]
+type = "equations"
+inputs = { u = "V" }
+states = { x = "m" }
+rates = { x = "a*x + b*u" }
+a = { mean = 1.0, std = 1.0 }
+b = { mean = 1.0, std = 0.5 }
+[measurement]
+columns = ["x"]
+"""
+
+
+def test_an_unstable_plant_under_feedback_is_identified_and_called_so(tmp_path):
+    """x' = 2 x + 1.5 u, u = -3 y + steps: a free simulation of a recording would grow e^24-fold."""
+    rng, a, b, dt, rows = np.random.default_rng(0), 2.0, 1.5, 0.05, 240
+    grown, x, log = math.exp(a * dt), 0.1, []
+    steps = np.repeat(rng.uniform(-1, 1, rows // 8), 8)
+    for excitation in steps:
+        y = x + 0.003 * rng.standard_normal()
+        u = excitation - 3.0 * y
+        log.append((u, y))
+        x = grown * x + (grown - 1) / a * b * u + 0.003 * rng.standard_normal()
+    u, y = np.array(log).T
+    data = pad([(dt * np.arange(rows), u[:, None], y[:, None])])
+    rig = _rig(tmp_path, BALANCED, TAIL.replace("0.5", "0.05"))
+    text = next(result for result in check(rig, data, None, key=jax.random.key(0)) if result.subject == "sampling").text
+    assert "unstable: deviations of x grow at 1 1/s, e-fold in 1 s" in text
+    fitted = identify(rig, data, key=jax.random.key(0))
+    for name, true in (("a", a), ("b", b)):
+        value, std = parameter_table(fitted)[name]
+        assert abs(value - true) < 4 * std and std < 0.1 * true
+
+
+SWING = """[model]
+type = "equations"
+inputs = []
+states = { th = "rad", w = "rad/s" }
+rates = { th = "w", w = "-g/L*sin(th) - c*w" }
+g = 9.81
+L = { mean = 0.5, std = 0.2 }
+c = { mean = 0.1, std = 0.1 }
+[measurement]
+columns = { px = "960 + 640*L*sin(th)" }
+noise_std = { px = 0.7 }
+"""
+
+
+def _swing(starts=(0.7, -0.5), rows=240, length=0.62, damping=0.2) -> tuple[Dataset, np.ndarray]:
+    """Readings of a pendulum without input, by Runge-Kutta steps of scipy; and its angular accelerations."""
+    t, out, fast = 0.03 * np.arange(rows), [], []
+    rate = lambda _, x: [x[1], -9.81 / length * np.sin(x[0]) - damping * x[1]]  # noqa: E731
+    for seed, start in enumerate(starts):
+        x = scipy.integrate.solve_ivp(rate, (0, t[-1]), [start, 0.0], t_eval=t, rtol=1e-9).y
+        noise = 0.7 * np.random.default_rng(seed).standard_normal(rows)
+        out.append((t, np.zeros((rows, 0)), (960 + 640 * length * np.sin(x[0]) + noise)[:, None]))
+        fast.append(rate(0, x)[1])
+    return pad(out), np.array(fast)
+
+
+def test_scales_are_those_of_the_readings_where_the_equations_rest(tmp_path):
+    """Without input the declared pendulum hangs still; the size of its motion is that of the readings."""
+    data, fast = _swing()
+    model = begin(_rig(tmp_path, SWING, TAIL.replace("0.5", "0.03")), data, key=jax.random.key(0)).model
+    size = np.exp(0.5 * np.asarray(model.log_q)) / 0.03
+    assert 0.5 < size[1] / np.sqrt(np.mean(fast**2)) < 2
+    np.testing.assert_allclose(np.asarray(model.unknown.scale), size, rtol=1e-9)
+    seen = motion(model, data)
+    np.testing.assert_allclose([seen.x[:, 0].min(), seen.x[:, 0].max()], [-0.6, 0.9], atol=0.4)  # L is not known
+
+
+DIVIDED = CHAIN.replace("(a - b)/tb", "(a - b)/u/tb")
+
+
+@pytest.mark.parametrize(
+    ("low", "mend"), [(0.0, "write max(u, 0.1) for u"), (-2.0, "write where(u < 0, min(u, -0.1), max(u, 0.1)) for u")]
+)
+def test_rates_that_are_infinite_are_named_with_file_rows_input_and_mend(tmp_path, low, mend):
+    data = _chain()
+    u = np.array(data.u)
+    u[0, :, 0] = np.where(np.arange(240) % 2, 2.0, low or 1.0)
+    u[0, 5:12] = 0.0
+    rig, data = _rig(tmp_path, DIVIDED), data._replace(u=u)
+    (found,) = [result for result in check(rig, data, None, key=jax.random.key(0)) if result.subject == "rates"]
+    text = "the rates of b are infinite or no number in sequence 0, 7 rows from 6 to 12; u is 0 there: "
+    assert found.mark == "error"
+    assert text + mend in found.text
+    with pytest.raises(RigError, match="sequence 0, 7 rows from 6 to 12"):
+        identify(rig, data, key=jax.random.key(0))
+    mended = _rig(tmp_path, CHAIN.replace("(a - b)/tb", "(a - b)/max(u, 0.1)/tb"))
+    assert not [result for result in check(mended, data, None, key=jax.random.key(0)) if result.subject == "rates"]
+
+
+def test_a_state_that_is_read_is_determined_where_it_rests_at_first(tmp_path):
+    data = _chain(rows=240)
+    u, y = np.array(data.u), np.array(data.y)
+    u[0], y[0, :, 0] = 0.0, 0.01 * np.random.default_rng(0).standard_normal(240)
+    u[0, 150:] = 1.0
+    y[0, 150:, 0] += 1.3 * 3.0 * (1 - np.exp(-0.5 * np.arange(90) / 4.0))
+    rig = _rig(tmp_path, CHAIN.replace('y = "b"', 'y = "b", z = "a"'))
+    data = data._replace(u=u, y=np.concatenate([y, y], axis=-1))
+    (found,) = [result for result in check(rig, data, None, key=jax.random.key(0)) if result.subject == "states"]
+    assert found.mark == "ok" and "determine 2 of 2" in found.text
+
+
 def test_readings_at_the_ends_of_their_range_are_not_read(tmp_path):
     rig = _rig(tmp_path, CHAIN + "range = { y = [0, 1.5] }\n")
     (tmp_path / "train").mkdir()
@@ -237,6 +378,46 @@ def test_a_fit_to_open_loop_errors_is_that_of_scipy(tmp_path):
 
     expected = scipy.optimize.minimize(loss, np.zeros(2 + begin_at.mean.size), method="BFGS").x
     np.testing.assert_allclose(np.append(best.z, best.start), expected, atol=5e-3)
+
+
+def test_a_simulation_that_runs_away_makes_no_step_singular():
+    """Derivatives of 1e12 leave of the prior's 1 nothing in the sums; those of far errors do not count at all."""
+    error, columns = np.full((1, 1, 40, 1), 0.1), np.ones((1, 1, 40, 1, 2))
+    of = simulated.Simulated(None, None, np.zeros(2), np.zeros((1, 1, 2)), error, columns, 1e12 * columns)  # type: ignore[arg-type]
+    scale, counts = np.ones((1, 1, 1, 1)), np.ones(error.shape, bool)
+    for step in simulated._normal(of, scale, counts).solved(0.0):
+        assert np.isfinite(step).all()
+    far = np.array(error)
+    far[0, 0, 20:] = 31.0
+    half = of._replace(error=error[:, :, :20], columns=columns[:, :, :20], by_start=columns[:, :, :20])
+    away = of._replace(error=far, by_start=columns, columns=np.where(far[..., None] > 1, 1e150, columns))
+    first = simulated._normal(half, scale, counts[:, :, :20])
+    variances = 0.1**2, (0.1**2 + simulated.HUBER * (2 * simulated.FARTHEST - simulated.HUBER)) / 2
+    ratio = simulated._normal(away, scale, counts).score / first.score
+    np.testing.assert_allclose(ratio, variances[0] / variances[1], rtol=1e-9)
+
+
+def test_a_fit_ends_when_its_time_is_over(tmp_path):
+    data = _chain()
+    fitted = begin(_rig(tmp_path), data, key=jax.random.key(0))
+    at = simulated.filtered(fitted.model, data)
+    with pytest.raises(TimeoutError):
+        simulated.fit_all([fitted.model], [fitted.m_step.prior], data, begin=at, scale=np.ones((1, 1, 1, 1)), until=0.0)
+
+
+def test_the_fit_of_the_smaller_errors_is_kept(tmp_path, monkeypatch):
+    """A fit to long horizons that is worse by the errors that it is fitted to is not kept."""
+    data, rig = _chain(), _rig(tmp_path)
+
+    def worse(fitted, data):
+        model = fitted.m_step.prior.write(fitted.model, jnp.asarray([3.0, 3.0]))
+        return fitted._replace(state=fitted.state._replace(best=model))
+
+    monkeypatch.setattr(identification, "fitted_to_horizon", worse)
+    fitted = identify(rig, data, key=jax.random.key(0))
+    table = parameter_table(fitted)
+    np.testing.assert_allclose([table["k"][0], table["ta"][0]], [1.3, 3.0], rtol=0.05)
+    assert 0 < table["k"][1] < 0.1
 
 
 def _simulated(error) -> simulated.Simulated:

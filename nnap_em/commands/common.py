@@ -22,6 +22,7 @@ from ..data.formats import has_logs, header, write_csv
 from ..data.logs import DataWarning, Logs, check_split, read_logs, together
 from ..data.rig import Rig, RigError, RigWarning, read_rig
 from ..em.build import build_system, measure_scales
+from ..em.equations import infinite_rates
 from ..em.loop import FitError
 from ..experiment.limits import DesignError
 from ..export.model import ExportError
@@ -187,12 +188,16 @@ def own_logs(args: argparse.Namespace, stored: Stored, log: Log) -> Dataset | No
 
 
 def warn_of_torques(folder: Path, bench: Bench) -> None:
-    """Warn where rates are not those of their coordinates, or inputs cannot be those of the declared bodies."""
+    """Warn where rates are not those of their coordinates, or inputs cannot be those of the declared bodies.
+
+    Raises DataError where rates of equations are infinite.
+    """
     rig, data = bench.rig, bench.train.data
-    found = list(rates(rig, data))
+    system, found = build_system(rig), list(rates(rig, data))
     if not rig.equations:
-        system = build_system(rig)
         found += torques(rig, system, data, measure_scales(rig, system, data))
+    elif infinite := infinite_rates(rig, system, bench.train):
+        raise DataError(f"{folder / 'train'}: {infinite}")
     for finding in found:
         if finding.mark == ERROR:
             warnings.warn(f"{folder / 'train'}: column {finding.text}", DataWarning, 2)

@@ -1,37 +1,54 @@
-"""First model of EM of a plant that is written as equations: scales by its own simulation with the declared numbers."""
+"""First model of EM of a plant that is written as equations: scales by its states along the readings."""
 
 import dataclasses
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple, cast
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
+from scipy.optimize import least_squares
 
 from ..data.dataset import Dataset
+from ..data.logs import Logs
 from ..data.rig import SMOOTH, Rig
 from ..effects.equations import NODES, UnknownTerm
 from ..model.friction import NoFriction
-from ..model.state_space import MOST_STEPS, Inputs, StateSpaceModel, with_effects
+from ..model.state_space import MOST_STEPS, StateSpaceModel, with_effects
+from ..numerics.digits import counted
 from ..numerics.gaussian import Gaussian
+from ..numerics.parallel import each
 from ..systems.equations import Equations
 from .prior import ParameterPrior
 from .readings import reading_noise
+from .simulated import followed
 
 
 class Motion(NamedTuple):
-    """A free simulation of the declared equations, by which scales are measured."""
+    """States along the readings, by which scales are measured."""
 
     x: Float[np.ndarray, "row state"]
     u: Float[np.ndarray, "row input"]
     rate: Float[np.ndarray, "row state"]
-    """Derivatives along it [1/s]."""
+    """Derivatives of the equations there [1/s]."""
     fastest: float
     """Largest eigenvalue of the linearised equations [1/s]."""
     slowest: float
     """Longest time constant [s]; infinite where nothing decays."""
+    growth: float = 0.0
+    """Rate at which neighbouring trajectories leave each other [1/s]; 0 where they do not."""
+    unstable: tuple[str, ...] = ()
+    """States in which they do."""
+    kept: tuple[str, ...] = ()
+    """States that keep a change of their start: integrators."""
+
+    @property
+    def size(self) -> Float[np.ndarray, " state"]:
+        """Root mean square of the rates, a thousandth of the largest at least."""
+        size = np.sqrt(np.mean(self.rate**2, axis=0)) if len(self.rate) else np.ones(self.x.shape[1])
+        return np.maximum(size, 1e-3 * size.max() + 1e-12)
 
 
 @eqx.filter_jit
@@ -45,29 +62,18 @@ def _rates(system: Equations, x: Float[Array, "row state"], u: Float[Array, "row
 def resting(system: Equations, known: dict[int, float], u: Float[np.ndarray, " input"]) -> Float[np.ndarray, " state"]:
     """State in which the equations are nearest to rest at inputs `u`, with some states as they are `known`.
 
-    Damped Gauss-Newton steps on all rates from 1, or from the known value.
+    By least squares of all rates, from 1; 1 where these are infinite there.
     """
     x = np.array([known.get(i, 1.0) for i in range(len(system.states))])
     free = [i for i in range(len(x)) if i not in known]
-    damping, error = 1e-3, math.inf
 
-    def rates(x: np.ndarray) -> list[np.ndarray]:
+    def rates(z: np.ndarray) -> list[np.ndarray]:
+        x[free] = z
         return [np.asarray(a)[0] for a in _rates(system, jnp.asarray(x[None], float), jnp.asarray(u[None], float))]
 
-    for _ in range(40 if free else 0):
-        rate, slope = rates(x)
-        if not np.isfinite(rate).all():
-            break
-        error, part = float(rate @ rate), slope[:, free]
-        gram = part.T @ part
-        step = np.linalg.lstsq(gram + damping * (np.diag(np.diag(gram)) + 1e-12 * np.eye(len(free))), part.T @ rate)[0]
-        trial = x.copy()
-        trial[free] -= step
-        after = rates(trial)[0]
-        better = np.isfinite(after).all() and after @ after < error
-        x, damping = (trial, 0.3 * damping) if better else (x, 10 * damping)
-        if damping > 1e9:
-            break
+    if free and all(np.isfinite(part).all() for part in rates(x[free])):
+        jac = lambda z: rates(z)[1][:, free]  # noqa: E731
+        x[free] = least_squares(lambda z: rates(z)[0], x[free], cast(Any, jac), x_scale="jac", max_nfev=100).x
     return x
 
 
@@ -99,12 +105,54 @@ def start_prior(rig: Rig, system: Equations, data: Dataset) -> tuple[Gaussian, t
 
 
 def motion(model: StateSpaceModel, data: Dataset) -> Motion:
-    """Simulation of all sequences from the mean of the start; where it runs away, its finite part."""
-    valid = np.asarray(data.valid)
-    x = np.asarray(_simulated(model, jnp.asarray(data.u, float)))
-    inside = valid & np.isfinite(x).all(axis=-1)
-    x, u = x[inside], np.asarray(data.u)[inside]
-    rate, slope = (np.asarray(a) for a in _rates(model.system, jnp.asarray(x), jnp.asarray(u, float)))
+    """States that the filter of a model has along the readings; where it runs away, its finite part.
+
+    A free simulation would rest where the equations do, and leave where they are unstable or wrong.
+    """
+    path, step, _ = (np.asarray(a) for a in each(followed, model, jax.device_put(data)))
+    valid, count = np.asarray(data.valid), len(model.system.states)
+    seen = _along(model.system, path[valid], np.asarray(data.u)[valid])
+    width = np.std(seen.x[:, :count], axis=0) if len(seen.x) else np.ones(count)
+    width = np.where(width > 0, width, 1.0)
+    rows = np.sum(valid, axis=1)
+    long = (rows >= np.median(rows)) & np.isfinite(path).all(axis=(1, 2))  # as long as half of the sequences are
+    step = step[long, : int(np.median(rows)) - 1, :count, :count] * width / width[:, None]
+    return seen._replace(**_modes(model.system.states, step, model.dt))
+
+
+def _modes(states: tuple[str, ...], step: Float[np.ndarray, "seq time state state"], dt: float) -> dict[str, Any]:
+    """Growth, unstable states and integrators by the products of the Jacobians of all steps.
+
+        Phi_k = A_{k-1} ... A_0,   growth = (log |Phi_n| - log |Phi_{n/2}|) / (n/2 dt)
+
+    the largest Lyapunov exponent; an integrator has 1 on the diagonal of Phi_k over the second half.
+    [Benettin et al. 1980, Meccanica 15(1), 9]
+    """
+    half, none = step.shape[1] // 2, np.zeros(len(step))
+    if not len(step) or not half:
+        return {}
+    unit, log, middle, held = np.broadcast_to(np.eye(len(states)), step[:, 0].shape), none, none, []
+    for k in range(2 * half):
+        unit = step[:, k] @ unit
+        norm = np.maximum(np.linalg.norm(unit, axis=(1, 2)), 1e-300)
+        unit, log = unit / norm[:, None, None], log + np.log(norm)
+        middle = log if k == half - 1 else middle
+        held += [np.exp(np.minimum(log, 50.0))[:, None] * np.einsum("sii->si", unit)] if k >= half else []
+    # Growth over half a recording [e-folds] from which on a mode is unstable: four integrators in series have 2
+    grown, least = float(np.mean(log - middle)), 2.0
+    kept = np.abs(np.mean(held, axis=(0, 1)) - 1) < 0.05  # a time constant of twenty recordings counts as none
+    if grown < least:
+        return {"kept": tuple(name for name, keeps in zip(states, kept, strict=True) if keeps)}
+    share = np.mean(np.linalg.svd(unit)[0][:, :, 0] ** 2, axis=0)  # of each state, in its motion
+    named = tuple(name for name, part in zip(states, share, strict=True) if part > 0.5 / len(states))
+    return {"growth": grown / (half * dt), "unstable": named}
+
+
+def _along(system: Equations, x: Float[np.ndarray, "row state"], u: Float[np.ndarray, "row input"]) -> Motion:
+    """The equations at some states and inputs, those left out where they are not finite."""
+    inside = np.isfinite(x).all(axis=-1)
+    x, u = x[inside], u[inside]
+    rate, slope = (np.asarray(a) for a in _rates(system, jnp.asarray(x), jnp.asarray(u, float)))
     sound = np.isfinite(rate).all(axis=-1) & np.isfinite(slope).all(axis=(1, 2))
     values = np.linalg.eigvals(slope[sound]) if sound.any() else np.zeros((1, 1))
     decay = np.median(np.max(np.where(values.real < 0, values.real, -np.inf), axis=1))
@@ -112,21 +160,17 @@ def motion(model: StateSpaceModel, data: Dataset) -> Motion:
     return Motion(x[sound], u[sound], rate[sound], float(np.percentile(np.abs(values), 99)), slowest)
 
 
-@eqx.filter_jit
-def _simulated(model: StateSpaceModel, u: Float[Array, "seq time input"]) -> Float[Array, "seq time state"]:
-    step = lambda x, row: (model.transition(x, Inputs.held(row)), x)  # noqa: E731
-    return jax.vmap(lambda u: jax.lax.scan(step, model.start.mean, u)[1])(u)
-
-
-def pace_of(rig: Rig, slowest: float, rows: int) -> float:
+def pace_of(rig: Rig, seen: Motion, rows: int) -> float:
     """The declared horizon, or some time constants, as far as the recordings are long [s]; of two digits: programs are
-    shared.
+    shared.  That of unstable equations is the time in which errors grow e-fold.
     """
     # Time in which horizons are counted, in slowest time constants: half of that later a start has no effect any more,
     # and errors are those of a free simulation
     constants = 8.0
     horizon_share = 1 / 3  # longest such time, as a share of a recording: a prediction needs a start before it
-    pace = rig.horizon or min(constants * slowest, horizon_share * rows * rig.dt)
+    pace = rig.horizon or min(constants * seen.slowest, horizon_share * rows * rig.dt)
+    if seen.growth and not rig.horizon:
+        return float(f"{max(min(pace, 1 / seen.growth), 4 * rig.dt):.2g}")
     return float(f"{max(pace, 8 * rig.dt):.2g}")
 
 
@@ -188,6 +232,47 @@ def _directions(system: Equations, term: UnknownTerm, names: tuple[str, ...], po
     return jax.vmap(one)(x, u)
 
 
+def _scaled(model: StateSpaceModel, seen: Motion) -> StateSpaceModel:
+    """The model with process noise as large as motion over a step, and as many steps as its fastest mode requires."""
+    scale = np.append(seen.size, np.full(len(model.system.ports) - len(seen.size), seen.size.max()))
+    stretch = 0.5  # integration step in fastest time constants, of which the classical Runge-Kutta method bears 2.8
+    return dataclasses.replace(
+        model,
+        unknown=NoFriction(jnp.asarray(scale, float), jointless=True),
+        log_q=jnp.asarray(2 * np.log(seen.size * model.dt), float),
+        substeps=min(max(1, 2 ** math.ceil(math.log2(max(seen.fastest * model.dt / stretch, 1.0)))), MOST_STEPS),
+    )
+
+
+def infinite_rates(rig: Rig, system: Equations, logs: Logs) -> str:
+    """Rates that are not finite in some rows: files, rows, inputs that are 0 there, and what to write; or nothing.
+
+    They are taken in the state of the start, with the inputs of every row.
+    """
+    u, valid = np.asarray(logs.data.u, float), np.asarray(logs.data.valid)
+    x = np.asarray(start_prior(rig, system, logs.data)[0].mean)
+    rates = lambda u: np.asarray(_rates(system, jnp.tile(x, (len(u), 1)), jnp.asarray(u))[0])  # noqa: E731
+    here, bad = np.zeros_like(valid), ~np.isfinite(rates(u[valid]))
+    here[valid] = bad.any(axis=1)
+    places = [(file, np.flatnonzero(rows)) for file, rows in zip(logs.files, here, strict=True) if rows.any()]
+    if not places:
+        return ""
+    named = [f"{file}, {counted(len(rows), 'row')} from {rows[0] + 1} to {rows[-1] + 1}" for file, rows in places[:3]]
+    named += [f"{len(places) - 3} more"] if len(places) > 3 else []
+    mends = []
+    for i, name in enumerate(rig.input_columns):
+        floor = float(f"{0.05 * np.abs(u[valid][:, i]).max():.1g}")  # a twentieth of what the formula was meant for
+        other = np.where(np.arange(u.shape[-1]) == i, floor, u[here])
+        if not u[here][:, i].any() and np.isfinite(rates(other)).all():
+            signed = f"where({name} < 0, min({name}, -{floor:g}), max({name}, {floor:g}))"
+            mend = f"max({name}, {floor:g})" if u[valid][:, i].min() >= 0 else signed
+            mends.append(f"{name} is 0 there: write {mend} for {name} in the formulas, or leave these rows out")
+    state = ", ".join(f"{name} = {value:.3g}" for name, value in zip(system.states, x, strict=True))
+    infinite = ", ".join(name for name, some in zip(system.states, np.any(bad, axis=0), strict=True) if some)
+    mend = " or ".join(mends) or f"look at the formulas with the inputs of these rows and {state}"
+    return f"the rates of {infinite} are infinite or no number in {'; '.join(named)}; {mend}"
+
+
 def build_equations(rig: Rig, system: Equations, data: Dataset):
     """Model that EM starts from, with noise as large as motion over a step; the prior of its parameters, entries of the
     start and readings whose noise is learned, and the log of the variance of the readings' noise in the logs.
@@ -206,22 +291,22 @@ def build_equations(rig: Rig, system: Equations, data: Dataset):
         dt=rig.dt,
         smooth=rig.input_hold == SMOOTH,
     )
-    seen = motion(model, data)
-    size = np.sqrt(np.mean(seen.rate**2, axis=0)) if len(seen.rate) else np.ones(count)
-    size = np.maximum(size, 1e-3 * size.max() + 1e-12)
+    u, mean = np.asarray(data.u)[np.asarray(data.valid)], np.asarray(start.mean)
+    variance = np.diag(np.asarray(start.cov))
+    unit = np.random.default_rng(0).standard_normal((len(u), count))
+    seen = _along(system, mean + unit * np.sqrt(variance), u)  # states as the start may be, for the noise of the filter
+    for _ in range(2):  # then as they are, the second time by the noise of the first
+        seen = motion(_scaled(model, seen), data)
+        far = np.mean((seen.x - mean) ** 2, axis=0) if len(seen.x) else variance
+        start = Gaussian(start.mean, jnp.asarray(np.diag(np.where(learned, np.maximum(variance, far), variance))))
+        model = dataclasses.replace(model, start=start)
+    model = _scaled(model, seen)
     rows = int(np.max(np.sum(np.asarray(data.valid), axis=1)))
-    scale = np.concatenate([size, np.full(ports - count, size.max())])
     free = tuple(n for n, d in rig.parameters.items() if d.std > 0)
     pairs = np.array([(rig.parameters[n].mean, rig.parameters[n].std) for n in free]).reshape(-1, 2)
     prior = ParameterPrior(free, jnp.asarray(pairs[:, 0], float), jnp.asarray(pairs[:, 1], float))
-    stretch = 0.5  # integration step in fastest time constants, of which the classical Runge-Kutta method bears 2.8
-    model = dataclasses.replace(
-        model,
-        unknown=NoFriction(jnp.asarray(scale, float), jointless=True),
-        log_q=jnp.asarray(2 * np.log(size * rig.dt), float),
-        substeps=min(max(1, 2 ** math.ceil(math.log2(max(seen.fastest * rig.dt / stretch, 1.0)))), MOST_STEPS),
-        pace=pace_of(rig, seen.slowest, rows),
-    )
+    model = dataclasses.replace(model, pace=pace_of(rig, seen, rows))
+    scale = np.asarray(cast(Any, model.unknown).scale)
     terms = unknown_terms(system, seen, free)
     for place, term in enumerate(terms):  # as large as what moves the port
         size = np.full(term.weights.shape, scale[system.ports.index(str(term.channel))])

@@ -10,6 +10,7 @@ algorithm", LNM 630; Bock 1983 for many starts]
 """
 
 import math
+import time
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -17,7 +18,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Bool, Float
 
 from ..data.dataset import Dataset
 from ..model.base import prepare
@@ -28,6 +29,8 @@ from .prior import ParameterPrior
 
 HUBER = 3.0
 """Errors of more standard deviations weigh less: of Gaussian ones three in a thousand."""
+FARTHEST = 30.0
+"""Errors of more standard deviations count as this many: a simulation that runs away has no size."""
 
 
 class Windows(eqx.Module):
@@ -94,13 +97,15 @@ class Simulated(NamedTuple):
 
 def filtered(model: StateSpaceModel, data: Dataset) -> Starts:
     """Starts of all windows by the filter of a model."""
-    path = np.asarray(each(_filtered, model, jax.device_put(data)))
+    path = np.asarray(each(followed, model, jax.device_put(data))[0])
     width = np.sqrt(np.mean(path[np.asarray(data.valid)] ** 2, axis=0))
     return Starts(path[:, windows(model, data).row[:, 0]], width + 1e-9)
 
 
-def _filtered(model: StateSpaceModel, seq: Dataset) -> Float[Array, "time state"]:
-    return ekf(model, model.start, prepare(model, seq), TANGENT).state.mean
+def followed(model: StateSpaceModel, seq: Dataset):
+    """States that the filter of a model has along a sequence, its Jacobians of the next state and of the reading."""
+    out = ekf(model, model.start, prepare(model, seq), TANGENT)
+    return out.state.mean, out.affine.matrix, out.reading.rows
 
 
 def simulated(model: StateSpaceModel, prior: ParameterPrior, data: Dataset, begin: Starts | None = None) -> Simulated:
@@ -189,7 +194,7 @@ def independent(of: Simulated) -> float:
 
 def cost(error: Errors, scale: Scale, counts: Counts) -> float:
     """Squared errors in scales; linear beyond `HUBER` [Huber 1964]."""
-    size = np.where(np.isfinite(error), np.minimum(np.abs(error) / scale, 30.0), 30.0)
+    size = np.where(np.isfinite(error), np.minimum(np.abs(error) / scale, FARTHEST), FARTHEST)
     return float(np.sum(np.where(counts, np.where(size < HUBER, size**2, HUBER * (2 * size - HUBER)), 0.0)))
 
 
@@ -214,23 +219,31 @@ class _Normal(NamedTuple):
 
     def solved(self, damping: float) -> tuple[np.ndarray, np.ndarray]:
         """Damped steps of parameters and starts."""
-        damped = lambda a: a + damping * np.einsum("...ij,ij->...ij", a, np.eye(a.shape[-1]))  # noqa: E731
         joint = np.concatenate([self.start_score[..., None], self.both], axis=-1)
-        inner = np.linalg.solve(damped(self.start_information), joint)
-        reduced = damped(self.information) - np.einsum("wsp,wsq->pq", self.both, inner[..., 1:])
-        step = np.linalg.solve(reduced, self.score - np.einsum("wsp,ws->p", self.both, inner[..., 0]))
+        inner = _solve(self.start_information, joint, damping)
+        information = self.information * (1 + damping * np.eye(len(self.score)))
+        reduced = information - np.einsum("wsp,wsq->pq", self.both, inner[..., 1:])
+        step = _solve(reduced, (self.score - np.einsum("wsp,ws->p", self.both, inner[..., 0]))[:, None])[:, 0]
         return step, inner[..., 0] - inner[..., 1:] @ step
 
     @property
     def reduced(self) -> Float[np.ndarray, "param param"]:
         """Precision of the parameters, all starts integrated out."""
-        inner = np.linalg.solve(self.start_information, self.both)
+        inner = _solve(self.start_information, self.both)
         return self.information - np.einsum("wsp,wsq->pq", self.both, inner)
+
+
+def _solve(a: Float[np.ndarray, "*n s s"], b: Float[np.ndarray, "*n s k"], damping: float = 0.0) -> np.ndarray:
+    """Solution of a x = b of positive definite matrices, in units of their diagonals: rounding makes none singular."""
+    unit = 1 / np.sqrt(np.maximum(np.einsum("...ii->...i", a), 1e-300))
+    scaled = a * unit[..., :, None] * unit[..., None, :] + (damping + 1e-12) * np.eye(a.shape[-1])
+    return unit[..., None] * np.linalg.solve(scaled, unit[..., None] * b)
 
 
 def _normal(of: Simulated, scale: Scale, counts: Counts, worth: float = 1.0) -> _Normal:
     """Normal equations by the errors that count, each `worth` so many independent ones."""
-    keep = counts & np.isfinite(of.error) & np.isfinite(of.columns).all(axis=-1) & np.isfinite(of.by_start).all(axis=-1)
+    keep = counts & np.isfinite(of.columns).all(axis=-1) & np.isfinite(of.by_start).all(axis=-1)
+    keep = keep & (np.abs(of.error) < FARTHEST * scale)  # no NaN is; what runs away costs the same wherever it is
     variance = max(cost(of.error, scale, counts) / max(float(np.sum(counts)), 1.0), 1e-12)
     with np.errstate(invalid="ignore", divide="ignore"):
         weight = worth * np.minimum(1.0, HUBER * scale / np.abs(of.error)) / (variance * scale**2)
@@ -248,11 +261,24 @@ def _normal(of: Simulated, scale: Scale, counts: Counts, worth: float = 1.0) -> 
     )
 
 
-def fit(model: StateSpaceModel, prior: ParameterPrior, data: Dataset, *, scale: Scale | None = None) -> Simulated:
-    """`fit_all` of one model, with the starts of its filter; without a scale that of its first errors."""
-    begin = filtered(model, data)
+def fit(
+    model: StateSpaceModel,
+    prior: ParameterPrior,
+    data: Dataset,
+    *,
+    scale: Scale | None = None,
+    begin: Starts | None = None,
+) -> Simulated:
+    """`fit_all` of one model, from the starts of its filter and in the scale of its first errors if none are given."""
+    begin = filtered(model, data) if begin is None else begin
     scale = scale_of(simulated(model, prior, data, begin)) if scale is None else scale
     return fit_all([model], [prior], data, begin=begin, scale=scale)[0]
+
+
+def in_time(until: float) -> None:
+    """Raise TimeoutError after `until` [s, of time.monotonic]."""
+    if time.monotonic() > until:
+        raise TimeoutError
 
 
 def fit_all(
@@ -264,17 +290,20 @@ def fit_all(
     scale: Scale,
     counts: Counts | None = None,
     steps: int = 40,
+    until: float = math.inf,
 ) -> list[Simulated]:
     """Models of one structure with the parameters of the largest `log_posterior`, side by side; their noise stays.
 
-    `counts` are the errors that count.
+    `counts` are the errors that count.  Raises TimeoutError where `until` [s, of time.monotonic] is over first.
     """
+    in_time(until)
     best = together(models, priors, [np.zeros_like(begin.mean)] * len(models), data, begin)
     known = best[0].observed & (True if counts is None else counts)
     values = [log_posterior(one, scale, known) for one in best]
     damping, open_ = [1e-2] * len(best), list(range(len(best)))
     falls = 0.01  # gain in the log of the posterior [nat] below which a fit ends
     for _ in range(steps):
+        in_time(until)
         ahead, moved = [], []
         for i in open_:
             step, start = _normal(best[i], scale, known).solved(damping[i])

@@ -14,11 +14,12 @@ from ..data.logs import REPEAT, Logs, logs_of_arrays
 from ..data.noise import reading_noise, resolution
 from ..data.rig import HELD, SMOOTH, Rig, RigError
 from ..data.servo import TORQUE
-from ..em.build import LAG, NO_MACHINE, Scales, measure_scales
-from ..em.equations import motion
+from ..em.build import LAG, NO_MACHINE, Scales, build_system, measure_scales
+from ..em.equations import infinite_rates, motion
 from ..em.readings import onset
 from ..em.scale import not_identifiable
 from ..em.servos import build_servos, steps_of_sample
+from ..em.simulated import followed, windows
 from ..model.base import prepare
 from ..model.friction import NoFriction
 from ..model.state_space import MOST_STEPS, StateSpaceModel
@@ -38,9 +39,8 @@ SEQUENCES, SECONDS, FEWEST_SAMPLES = 6, 1.0, 10
 where samples are that slow]: a wrong model loses a hidden joint later on."""
 POSES = 256
 """Rows of the logs, evenly over them, in which the loads of joints are taken."""
-RECORDED, DETERMINED_WITHIN = 10.0, 0.25
-"""Length of a recording in slowest time constants, and of the part that must determine the state, in the pace of the
-model."""
+RECORDED = 10.0
+"""Length of a recording in slowest time constants."""
 REVERSALS = 20
 """Changes of direction below which logs hardly show memory: a contact has ten numbers, and a reversal shows two, the
 distance over which friction turns and its size."""
@@ -66,7 +66,7 @@ class Along(NamedTuple):
     """Jacobian of the next state."""
     reading: Float[np.ndarray, "seq time obs state"]
     """Jacobian of the reading."""
-    rate: Float[np.ndarray, "seq time state state"]
+    rate: Float[np.ndarray, "seq time state state"] | None = None
     """Jacobian of the time derivative of the state [1/s]."""
 
 
@@ -99,6 +99,11 @@ def check(
     if amount[0].mark == ERROR:
         return amount
     try:
+        if rig.equations:
+            parts = (("train", train), ("test", test))
+            logs = [(name, infinite_rates(rig, build_system(rig), part)) for name, part in parts if part is not None]
+            if broken := [CheckResult(ERROR, "rates", f"{name}: {text}") for name, text in logs if text]:
+                return [*amount, *broken]
         problem = begin(rig, data, key=key)
     except RigError:
         return [CheckResult(ERROR, "bodies", f"{NO_MACHINE}: look at their signs and units"), *amount]
@@ -130,24 +135,35 @@ def _window(dt: float, seconds: float = SECONDS) -> int:
 
 
 def _equations(rig: Rig, problem: Identified, data: Dataset) -> Iterator[CheckResult]:
-    """Time constants of equations against rows and recordings, noise, and observability of their states."""
+    """Modes of equations against rows and recordings, noise, and observability of their states over whole logs."""
     model, longest = problem.model, float(data.valid.sum(axis=1).max()) * rig.dt
     seen = motion(model, data)
-    fastest = 1 / max(seen.fastest, 1e-12)
+    fastest, growing = 1 / max(seen.fastest, 1e-12), 1 / seen.growth if seen.growth else np.inf
     hints = [
-        (not len(seen.rate), "a simulation of the equations runs away: look at signs, units and parameters"),
+        (not len(seen.rate), "no states follow the readings: look at signs, units and parameters"),
+        (growing < 2 * rig.dt, "errors grow too fast between two rows: sample faster, or look at units and signs"),
         (fastest < rig.dt, "the fastest is over between two rows: sample faster, or look at the units of parameters"),
-        (longest < RECORDED * seen.slowest, f"record {RECORDED:g} of the slowest at least, here {longest:.3g} s"),
+        (
+            longest < RECORDED * seen.slowest < np.inf,
+            f"record {RECORDED:g} of the slowest at least, here {longest:.3g} s",
+        ),
     ]
     remarks = [hint for holds, hint in hints if holds]
-    constants = f"time constants of the declared equations are {fastest:.3g} to {seen.slowest:.3g} s"
-    text = f"{constants}, rows {rig.dt:g} s apart; predictions are judged up to {model.pace:g} s ahead"
-    yield CheckResult(_mark(remarks, hints[0][0]), "sampling", "; ".join([text, *remarks]))
+    constants = f"time constants of the declared equations are {fastest:.3g} to {seen.slowest:.3g} s, "
+    modes = [f"rows {rig.dt:g} s apart" if np.isinf(seen.slowest) else f"{constants}rows {rig.dt:g} s apart"]
+    modes += [f"integrators: {', '.join(seen.kept)}"] if seen.kept else []
+    grown = (
+        f"unstable: deviations of {', '.join(seen.unstable)} grow at {seen.growth:.3g} 1/s, e-fold in {growing:.3g} s"
+    )
+    modes += [grown] if seen.growth else []
+    text = f"{'; '.join(modes)}; predictions are judged up to {model.pace:g} s ahead"
+    yield CheckResult(_mark(remarks, hints[0][0] or hints[1][0]), "sampling", "; ".join([text, *remarks]))
     yield from _noise(rig, model, data)
-    rows = min(data.valid.shape[1], _window(rig.dt, DETERMINED_WITHIN * model.pace) + 1)
-    head = _first(data, rows)
-    along = Along(*(np.asarray(part) for part in each(_along, (model, problem.smoother, problem.state.key), head)))
-    yield from _observability(model, along, np.asarray(head.valid), rows - 1)
+    at = windows(model, data)  # a start that nothing shows, as at rest, is one of many
+    place = at.rows * np.arange(at.count)[:, None] + np.arange(at.rows)
+    cut = lambda part: np.asarray(part)[:, place].reshape(-1, at.rows, *part.shape[2:])  # noqa: E731
+    along = Along(*map(cut, each(followed, model, jax.device_put(data))))
+    yield from _observability(model, along, cut(data.valid), at.rows)
 
 
 def _first(data: Dataset, rows: int) -> Dataset:
@@ -183,7 +199,7 @@ def _amount(rig: Rig, data: Dataset, test: Logs | None) -> Iterator[CheckResult]
     short = f"the shortest is {rows.min() * rig.dt:.2g} s: leave out what is under 60 rows" if rows.min() < 60 else ""
     too_long = rows.max() * rig.dt > _LONG[0] and rows.max() > _LONG[1] and not rig.equations
     long = "cut them into sequences of some seconds" if too_long else ""
-    little = "more would make the curve surer" if rows.sum() < 1000 else ""
+    little = f"more would make the {'numbers' if rig.equations else 'curve'} surer" if rows.sum() < 1000 else ""
     mark = _mark(short or long or little, shortage)
     amount = f"{counted(len(rows), 'training sequence')}, {rows.sum() * rig.dt:.3g} s, {rows.sum()} rows"
     yield CheckResult(mark, "length", "; ".join(filter(None, (amount, shortage or little, short, long))))
@@ -240,7 +256,7 @@ def _rough(train: Logs) -> Iterator[CheckResult]:
 
 def _sampling(rig: Rig, along: Along, scales: Scales) -> Iterator[CheckResult]:
     """Samples per period of the fastest eigenvalue, and how much a velocity changes between two."""
-    rate = along.rate[:, ::10].reshape(-1, *along.rate.shape[-2:])
+    rate = np.asarray(along.rate)[:, ::10].reshape(-1, *along.transition.shape[-2:])
     fastest = np.max(np.abs(np.linalg.eigvals(rate[np.isfinite(rate).all(axis=(1, 2))])), initial=0.0)
     turn = float(np.max(scales.acceleration * rig.dt / scales.speed))
     period = 2 * np.pi / max(float(fastest), 1e-9)
@@ -259,7 +275,7 @@ def _noise(rig: Rig, model: StateSpaceModel, data: Dataset) -> Iterator[CheckRes
         declared = rig.noise_std.get(name)
         noisy = max(seen, declared or 0.0) > 0.3 * spread
         alone = name not in model.system.sensors  # of three axes one may sense nothing
-        drowned = "; the motion hardly rises above it: move more, or look at the units" if noisy else ""
+        drowned = "; the motion hardly rises above it: move or excite more, or look at the units" if noisy else ""
         codes = resolution(signal)
         steps = f"; it reads codes {codes:.2g} {unit} apart and repeats them, which is noise of {codes / 12**0.5:.2g}"
         drowned += steps if codes else ""
@@ -539,7 +555,8 @@ def _observability(
     text += f" (condition 1e{condition:.0f})"
     text += f"; not determined: {', '.join(dark)}" if dark else ""
     text += f"; hardly determined: {', '.join(weak)}" if weak else ""
-    text += ": measure more of the state, or move so that the hidden joint shakes the rest" if spoilt else ""
+    shown = "move so that the hidden joint shakes the rest" if dof else "change the inputs so that it shows"
+    text += f": measure more of the state, or {shown}" if spoilt else ""
     yield CheckResult(_mark(dark or weak, spoilt), "states", text)
 
 

@@ -10,12 +10,13 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from ..data.dataset import Dataset
-from ..data.logs import Logs, sequences_of
-from ..data.rig import Declared, Rig
+from ..data.logs import Logs, logs_of_arrays, sequences_of
+from ..data.rig import Declared, Rig, RigError
 from ..data.units import quantities
 from ..effects import AbstractEffect
 from ..em import simulated
 from ..em.build import build, build_system
+from ..em.equations import infinite_rates
 from ..em.loop import (
     EPOCHS,
     RESTED,
@@ -152,7 +153,10 @@ def identify(
     watch: Watch = unwatched,
 ) -> Identified:
     """Fit the declared unknowns of a rig to logs by EM, friction as a static map: `nnap_em.identify` without memory."""
-    data = sequences_of(data, rig)
+    logs = logs_of_arrays(data, rig)
+    data = sequences_of(logs, rig)
+    if rig.equations and (infinite := infinite_rates(rig, build_system(rig), logs)):
+        raise RigError(f"rig {rig.name!r}: {infinite}")
     if start is None:
         rig = holding(rig, not_identifiable(rig, build_system(rig), data))
     fitted = begin(rig, data, key=key) if start is None else start
@@ -205,15 +209,19 @@ def _simulating(fitted: Identified, data: Dataset) -> Identified:
 
     Likelihood alone trades long for short predictions: process noise of a hidden state stands for all that is slow.
     """
-    prior = fitted.m_step.prior
-    likely = simulated.simulated(fitted.model, prior, data)
-    scale = simulated.scale_of(likely)
-    declared = prior.write(fitted.model, jnp.zeros_like(prior.mean))
-    fits = [simulated.fit(model, prior, data, scale=scale) for model in (declared, fitted.model)]
+    prior, model = fitted.m_step.prior, fitted.model
+    begin = simulated.filtered(model, data)  # one prior of the starts for all that are compared
+    scale = simulated.scale_of(simulated.simulated(model, prior, data, begin))
+    declared = prior.write(model, jnp.zeros_like(prior.mean))
+    fits = [simulated.fit(one, prior, data, scale=scale, begin=begin) for one in (declared, model)]
     best = max(fits, key=lambda of: simulated.log_posterior(of, scale, of.observed))
     kept = fitted_to_horizon(fitted._replace(state=fitted.state._replace(best=best.model)), data)
-    fits = (simulated.fit(one.model, _nothing(prior), data, scale=scale) for one in (fitted, kept))
-    return kept._replace(horizon_note=_horizon_note(kept, *fits))
+    likely, last = (simulated.fit(one.model, _nothing(prior), data, scale=scale, begin=begin) for one in (fitted, kept))
+    costs = [simulated.cost(of.error, scale, of.observed) for of in (likely, last)]
+    if costs[0] < costs[1]:
+        own = simulated.simulated(model, prior, data, begin)
+        kept = fitted._replace(state=fitted.state._replace(hessian=jnp.asarray(simulated.precision(own))))
+    return kept._replace(horizon_note=_horizon_note(kept, likely, last))
 
 
 def _nothing(prior: ParameterPrior) -> ParameterPrior:
@@ -241,7 +249,7 @@ def _horizon_note(fitted: Identified, likely: simulated.Simulated, best: simulat
     unit = fitted.model.system.unit
     each = zip(fitted.rig.measured, first, second, strict=True)
     parts = [f"{name}: {a:.3g} and {b:.3g} {unit(name)}".rstrip() for name, a, b in each]
-    text = "errors of free simulations of the fit by likelihood and of the one to such errors, which is kept: "
+    text = "errors of free simulations of the fit by likelihood and of the one to such errors: "
     worse = 1.2  # error of the likelier fit over that of the fit to such errors from which on they differ
     odd = " They differ: something is missing in the equations." if np.any(first > worse * second) else ""
     return f"{text}{', '.join(parts)}.{odd}"

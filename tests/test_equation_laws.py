@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import math
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -15,7 +16,9 @@ from nnap_em.data.dataset import pad
 from nnap_em.data.rig import read_rig
 from nnap_em.diagnosis import equations
 from nnap_em.diagnosis.equations import FOLDS, Case, folds, search_equations
-from nnap_em.effects import Candidate, OperatingPoint, catalogue, flat
+from nnap_em.diagnosis.findings import suspected
+from nnap_em.diagnosis.outcome import Diagnosis, Step, Suspect
+from nnap_em.effects import Candidate, OperatingPoint, SensorEffect, catalogue, flat
 from nnap_em.effects.equations import UnknownTerm
 from nnap_em.em.equations import free_term, motion, unknown_terms
 from nnap_em.em.simulated import Simulated, Windows
@@ -227,6 +230,35 @@ def test_a_missing_flow_is_named_and_nothing_where_nothing_is_missing(tmp_path, 
     before = identify(_rig(tmp_path), data, key=jax.random.key(0))
     closed = search_equations(before, data, lambda text: None)
     assert {(effect.channel, effect.reads) for effect in closed.after.model.effects} == names
+
+
+def test_a_search_that_fails_late_or_is_out_of_time_keeps_what_it_has(tmp_path, monkeypatch):
+    """Fits of sensors are singular, fits of two laws are out of time: the flow that was found first is reported."""
+    data, whole = _logs(0.25), equations.simulated.fit_all
+    before = identify(_rig(tmp_path), data, key=jax.random.key(0))
+
+    def failing(models, *rest, **options):
+        if len(models[0].effects) > 1:
+            raise TimeoutError
+        if any(isinstance(effect, SensorEffect) for effect in models[0].effects):
+            raise np.linalg.LinAlgError("Singular matrix")
+        return whole(models, *rest, **options)
+
+    monkeypatch.setattr(equations.simulated, "fit_all", failing)
+    monkeypatch.setattr(equations, "free_functions", lambda *_: [])
+    closed = search_equations(before, data, lambda text: None)
+    assert [(effect.channel, effect.reads) for effect in closed.after.model.effects] == [("a", ("b",))]
+    monkeypatch.setattr(equations.simulated, "fit_all", whole)
+    late = search_equations(before, data, lambda text: None, until=0.0)
+    assert (late.complete, late.after.model.effects, len(late.steps)) == (False, (), 1)
+
+
+def test_a_suspect_of_equations_states_no_chance():
+    """No placebo is tried, so that nothing is said of chance."""
+    key = "linear_flow", None, "a", ("b",)
+    step = Step(9, (), (), None, 3, suspects=(Suspect(key, 0.12, math.nan),))
+    (suspect,) = suspected(Diagnosis(None, None, (), (step,)))  # type: ignore[arg-type]
+    assert suspect.description.endswith("would remove 12% of the squared prediction error")
 
 
 def test_an_acrobot_as_equations_moves_as_the_built_in_one():

@@ -104,8 +104,11 @@ class Search(NamedTuple):
 
     def fit(
         self, hypothesis: Hypothesis, every: Sequence[tuple[Sequence[Candidate], Sequence[Any]]], **options: Any
-    ) -> list[Case]:
-        """The hypothesis with each of some sets of laws, and the numbers that these begin with, fitted."""
+    ) -> dict[int, Case]:
+        """The hypothesis with each of some sets of laws, and the numbers that these begin with, fitted, by their place.
+
+        What cannot be fitted, or not in time, is left out.
+        """
         full = [self.with_laws(hypothesis, laws, starts) for laws, starts in every]
         groups: dict[Any, list[int]] = {}
         for i, one in enumerate(full):
@@ -114,11 +117,15 @@ class Search(NamedTuple):
         cases: dict[int, Case] = {}
         for places in groups.values():
             models, priors = ([get(full[i]) for i in places] for get in (lambda h: h.model, lambda h: h.m_step.prior))
-            fits = simulated.fit_all(models, priors, self.data, scale=self.scale, begin=self.begin, **options)
+            options |= {"scale": self.scale, "begin": self.begin, "until": self.until}
+            try:
+                fits = simulated.fit_all(models, priors, self.data, **options)
+            except (TimeoutError, np.linalg.LinAlgError):
+                continue
             for i, of in zip(places, fits, strict=True):
                 density = simulated.log_posterior(of, self.scale, of.observed)
                 cases[i] = Case(tuple(every[i][0]), of, -density)
-        return [cases[i] for i in range(len(every))]
+        return cases
 
     def loss(self, of: simulated.Simulated, counts: Bool[np.ndarray, "seq window #place 1"] | None = None) -> float:
         """Squared error of the predictions that count."""
@@ -129,17 +136,17 @@ class Search(NamedTuple):
         """The hypothesis with each candidate, fitted; the best case of every law, best first."""
         cases = self.fit(hypothesis, [((c,), c.probes[:1]) for c in candidates], steps=SCREEN_STEPS)
         best: dict[tuple[Key, ...], Case] = {}
-        for case in sorted(cases, key=lambda case: case.loss):
+        for case in sorted(cases.values(), key=lambda case: case.loss):
             best.setdefault(case.keys, case)
         return list(best.values())
 
     def judged(self, hypothesis: Hypothesis, cases: Sequence[Case], null: Sequence[float]) -> list[Case]:
         """The cases with their errors on parts left out, beside those of `null` on each."""
         out = []
-        for case, left in zip(cases, self.left_out(hypothesis, cases), strict=True):
+        for i, left in self.left_out(hypothesis, cases).items():
             gains = tuple(1 - b / max(a, 1e-12) for a, b in zip(null, left, strict=True))
             share = 1 - sum(left) / max(sum(null), 1e-12)
-            out.append(case._replace(share=share, left=sum(left), folds=gains))
+            out.append(cases[i]._replace(share=share, left=sum(left), folds=gains))
         return out
 
     def room(self, of: simulated.Simulated) -> float:
@@ -152,12 +159,14 @@ class Search(NamedTuple):
         change = np.ma.mean(np.diff(np.ma.masked_invalid(of.error), axis=2) ** 2, axis=(0, 1, 2)) / 2
         return 1 - float(np.mean(np.minimum(logs**2, np.ma.filled(change, np.inf)) / self.scale**2))
 
-    def left_out(self, hypothesis: Hypothesis, cases: Sequence[Case]) -> list[list[float]]:
-        """Squared errors of every case on every part by the fit to the others."""
-        every, out = [(case.laws, case.effects) for case in cases], [[] for _ in cases]
+    def left_out(self, hypothesis: Hypothesis, cases: Sequence[Case]) -> dict[int, list[float]]:
+        """Squared errors of every case on every part by the fit to the others, by its place; only of those whose fits
+        all came to an end.
+        """
+        every, out = [(case.laws, case.effects) for case in cases], {i: [] for i in range(len(cases))}
         for counts in folds(simulated.windows(self.before.model, self.data), len(self.data.t)) if cases else ():
-            for errors, case in zip(out, self.fit(hypothesis, every, counts=~counts, steps=JUDGED_STEPS), strict=True):
-                errors.append(self.loss(case.of, counts))
+            fits = self.fit(hypothesis, every, counts=~counts, steps=JUDGED_STEPS)
+            out = {i: [*errors, self.loss(fits[i].of, counts)] for i, errors in out.items() if i in fits}
         return out
 
 
@@ -216,12 +225,9 @@ def search_equations(before: Identified, data: Dataset, log: Log, until: float =
     kinds = [kind for kind in catalogue.values() if issubclass(kind, PortEffect | SensorEffect | DriveEffect)]
     every = [candidate for kind in kinds for candidate in kind.candidates(around)]
     free = free_functions(before, around, data)
-    while len(hypothesis.model.effects) - declared < MOST_LAWS:
-        if time.monotonic() > until:
-            complete = False
-            break
+    while complete and len(hypothesis.model.effects) - declared < MOST_LAWS:
         chosen, alike, step = _round(search, hypothesis, every, free)
-        steps.append(step)
+        steps, complete = [*steps, step], time.monotonic() <= until
         if chosen is None:
             break
         for law, effect in zip(chosen.laws, chosen.effects, strict=True):
@@ -259,24 +265,28 @@ def _round(
     first = simulated.simulated(lean.model, lean.m_step.prior, search.data, begin)
     search = search._replace(begin=begin, scale=simulated.scale_of(first))
     present = {key_of(effect) for effect in hypothesis.model.effects}
-    null = search.fit(lean, [((), ())])[0]
-    search = search._replace(scale=simulated.scale_of(null.of))
-    base = search.left_out(lean, [null])[0]
-    fresh = [c for c in every if key_of(c.start) not in present]
     log, rows = search.log, search.data.t.shape[1]
+    nothing = None, (), Step(rows, (), (), None, 0, MEASURE)
+    if not (fits := search.fit(lean, [((), ())])):
+        return nothing
+    null = fits[0]
+    search = search._replace(scale=simulated.scale_of(null.of))
+    if not (parts := search.left_out(lean, [null])):
+        return nothing
+    base, fresh = parts[0], [c for c in every if key_of(c.start) not in present]
     whole, room = search.loss(null.of), search.room(null.of)
     log(f"{len(fresh)} candidates; {max(room, 0.0):.0%} of the squared error is not noise of the readings")
     if room < MULTI_STEP:
-        return None, (), Step(rows, (), (), None, 0, MEASURE)
+        return nothing
     singles = search.screened(lean, fresh)
     short = [case for n in range(1, 4) for case in [c for c in singles if c.numbers == n and _sound(c)][:SHORTLIST]]
     judged = search.judged(lean, short, base)
     passing, tried = [case for case in judged if _passes(case)], [*judged]
     most = max([MULTI_STEP, *(case.share for case in passing)]) / PAIR
-    if room > most and time.monotonic() < search.until:  # else no pair and no function could be chosen
+    if room > most:  # else no pair and no function could be chosen
         both = itertools.combinations(singles[:PARTNERS], 2)
         joined = [((*a.laws, *b.laws), (*a.effects, *b.effects)) for a, b in both]
-        pairs = sorted(search.fit(lean, joined, steps=SCREEN_STEPS), key=lambda case: case.loss)
+        pairs = sorted(search.fit(lean, joined, steps=SCREEN_STEPS).values(), key=lambda case: case.loss)
         functions = search.screened(lean, [c for c in free if key_of(c.start) not in present])
         best = [*[case for case in pairs if _sound(case)][:PAIRS_JUDGED], *functions[:FREE]]
         tried += search.judged(lean, best, base)
@@ -289,7 +299,7 @@ def _round(
     suspects = ()
     if best is None:
         near = sorted((c for c in judged if c.share > SUSPECT_SHARE and _sound(c)), key=lambda c: -c.share)
-        suspects = tuple(Suspect(case.keys[0], case.share, 0.0) for case in near[:4])
+        suspects = tuple(Suspect(case.keys[0], case.share, math.nan) for case in near[:4])
     accepted = best.keys[0] if best else None
     step = Step(rows, listed, refitted, accepted, len(fresh), MEASURE, suspects=suspects)
     return best, tuple(case.keys[0] for case in alike if case is not best and len(case.laws) == 1), step

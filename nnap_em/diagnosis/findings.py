@@ -229,7 +229,7 @@ class SuspectReport(NamedTuple):
     share_of_error: float
     """Share of the squared prediction error that it would remove [0 to 1]."""
     chance: float
-    """Largest such share of any law whose columns are shifted in time [0 to 1]."""
+    """Largest such share of any law whose columns are shifted in time [0 to 1]; NaN where none was tried."""
     law: str
     description: str
     confirm: str
@@ -241,10 +241,9 @@ def suspected(diagnosis: Diagnosis) -> list[SuspectReport]:
     out = []
     for suspect in [entry for step in diagnosis.last for entry in step.suspects]:
         law, confirm = words(suspect.key), catalogue[suspect.key[0]].confirm
-        text = (
-            f"{law} would remove {share_of(suspect.share, 'the squared prediction error')}, "
-            f"where chance removes {f'up to {suspect.chance:.0%}' if suspect.chance >= 0.005 else 'less than 1%'}"
-        )
+        text = f"{law} would remove {share_of(suspect.share, 'the squared prediction error')}"
+        by_chance = f"up to {suspect.chance:.0%}" if suspect.chance >= 0.005 else "less than 1%"
+        text += f", where chance removes {by_chance}" if math.isfinite(suspect.chance) else ""
         place, share, chance = place_of(suspect.key), suspect.share, suspect.chance
         out.append(
             SuspectReport(**place, share_of_error=share, chance=chance, law=law, description=text, confirm=confirm)
@@ -277,7 +276,7 @@ def advice(
             out.append(f"To discriminate it from {words(key)}: {catalogue[key[0]].confirm}")
     if not out:
         out.append(
-            "Longer or livelier motion shows weaker effects; drive every joint through its whole range of speed."
+            "Longer or livelier recordings show weaker effects; drive every joint or input through its whole range."
         )
     return out
 

@@ -16,7 +16,7 @@ class Suspect(NamedTuple):
     share: float
     """Share of the squared multi-step error, before any refit [0 to 1]."""
     chance: float
-    """Largest share of any placebo that the parts left out confirm."""
+    """Largest share of any placebo that the parts left out confirm; NaN where none was tried."""
 
 
 class Step(NamedTuple):

@@ -34,8 +34,8 @@ class MotorGain(InputEffect):
     """gain u."""
 
     name: ClassVar[str] = "motor_gain"
-    meaning: ClassVar[str] = "The motor delivers another torque than commanded, in a fixed proportion."
-    confirm: ClassVar[str] = "Block the joint and measure its torque at one command."
+    meaning: ClassVar[str] = "The drive delivers more or less than commanded, in a fixed proportion."
+    confirm: ClassVar[str] = "Hold the output still (block the joint) and measure what the drive gives at one command."
     units: ClassVar[dict[str, str]] = {"gain": "-"}
     words: ClassVar[dict[str, str]] = {"gain": "delivered / commanded"}
     excess: Scalar
@@ -57,7 +57,7 @@ class DeadZone(InputEffect):
 
     name: ClassVar[str] = "dead_zone"
     meaning: ClassVar[str] = "Small commands have no effect."
-    confirm: ClassVar[str] = "Raise the command slowly from zero until the joint moves, both ways."
+    confirm: ClassVar[str] = "Raise the command slowly from zero until something moves, both ways."
     units: ClassVar[dict[str, str]] = {"width": "N m"}
     words: ClassVar[dict[str, str]] = {"width": "half width"}
     above_zero: ClassVar[str] = "width"
@@ -77,7 +77,7 @@ class Saturation(InputEffect):
     """Limited to +-limit."""
 
     name: ClassVar[str] = "saturation"
-    meaning: ClassVar[str] = "The motor cannot deliver more than a limit."
+    meaning: ClassVar[str] = "The drive cannot deliver more than a limit."
     confirm: ClassVar[str] = (
         "Block the joint and raise the command until the torque stays the same; look at the drive's current limit."
     )
@@ -128,7 +128,7 @@ class InputDelay(DriveEffect):
 
     name: ClassVar[str] = "input_delay"
     meaning: ClassVar[str] = "Commands act late."
-    confirm: ClassVar[str] = "Log command and motor current on one clock."
+    confirm: ClassVar[str] = "Log the command and what the drive gives, as its current, on one clock."
     units: ClassVar[dict[str, str]] = {"delay": "s"}
     above_zero: ClassVar[str] = "delay"
     delay: Scalar
@@ -161,8 +161,8 @@ class ActuatorLag(DriveEffect):
     """First-order lag of time constant tau, the mean over each sample of the exact response."""
 
     name: ClassVar[str] = "actuator_lag"
-    meaning: ClassVar[str] = "The motor follows its command gradually."
-    confirm: ClassVar[str] = "Log command and motor current on one clock, for a step."
+    meaning: ClassVar[str] = "The drive follows its command gradually."
+    confirm: ClassVar[str] = "Log the command and what the drive gives, as its current, on one clock, for a step."
     units: ClassVar[dict[str, str]] = {"tau": "s"}
     words: ClassVar[dict[str, str]] = {"tau": "time constant"}
     above_zero: ClassVar[str] = "tau"

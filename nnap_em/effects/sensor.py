@@ -15,7 +15,7 @@ class SensorBias(SensorEffect):
 
     name: ClassVar[str] = "sensor_bias"
     meaning: ClassVar[str] = "A sensor is off by a constant."
-    confirm: ClassVar[str] = "Bring the joint to a known position and read the sensor."
+    confirm: ClassVar[str] = "Bring what it reads, as a joint, to a known value and read the sensor."
     units: ClassVar[dict[str, str]] = {"bias": "unit of the channel"}
     bias: Scalar
 
@@ -38,7 +38,7 @@ class SensorScale(SensorEffect):
 
     name: ClassVar[str] = "sensor_scale"
     meaning: ClassVar[str] = "A sensor reads too large or too small, in a fixed proportion."
-    confirm: ClassVar[str] = "Move the joint by a known angle and compare."
+    confirm: ClassVar[str] = "Change what it reads, as an angle, by a known amount and compare."
     units: ClassVar[dict[str, str]] = {"scale": "-"}
     words: ClassVar[dict[str, str]] = {"scale": "reading / value"}
     excess: Scalar
@@ -60,7 +60,7 @@ class SensorDelay(SensorEffect):
 
     name: ClassVar[str] = "sensor_delay"
     meaning: ClassVar[str] = "A sensor reports late."
-    confirm: ClassVar[str] = "Tap the link and compare the sensor with a second one on the same clock."
+    confirm: ClassVar[str] = "Tap the link, or make a step, and compare the sensor with a second one on the same clock."
     units: ClassVar[dict[str, str]] = {"delay": "s"}
     above_zero: ClassVar[str] = "delay"
     delay: Scalar

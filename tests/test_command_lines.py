@@ -81,7 +81,6 @@ VALUES: dict[str, list[str]] = {
     "--urdf": ["{out}.urdf"],
     "--c": ["{out}.c"],
     "--observer": ["{out}.c"],
-    "--mcap": ["{out}.mcap"],
     "--out": ["{out}"],
 }
 """Cheap values of options; `{out}` is a name that is new in each run."""

@@ -10,7 +10,7 @@ import pytest
 from helpers import pendulum_rig
 from recorders import EPOCH, JOINTS, MULTI, NS, TOPICS, arrays, joint_states, ns, ros2, write_hdf5, write_mcap
 
-from nnap_em.data import formats
+from nnap_em.data import dates, formats
 from nnap_em.data.dataset import DataError
 from nnap_em.data.rig import read_rig
 from nnap_em.import_ import clock
@@ -207,13 +207,19 @@ DATES = {
     "2023-11-14 23:13:20,005+01:00": 1_700_000_000.005,
     "2023/11/14 22:13:20": 1_700_000_000.0,
     "20231114T221320Z": 1_700_000_000.0,
-    "22:13:20": np.inf,
+    "14.11.2023 22:13:20": 1_700_000_000.0,
+    "11/14/2023 10:13:20 PM": 1_700_000_000.0,
+    "14-Nov-2023 12:00:00 AM": 1_699_920_000.0,
+    "2023-11-14": 1_699_920_000.0,
+    "22:13:20,5": 80_000.5,
+    "2023-13-14": np.inf,
+    "13:20.5": np.inf,
 }
 
 
 @pytest.mark.parametrize("text, moment", DATES.items())
-def test_dates_of_iso_8601_are_seconds(text, moment):
-    assert formats.seconds(text) == moment
+def test_dates_and_times_of_day_are_seconds(text, moment):
+    assert dates.moments([text])[0] == pytest.approx(moment, abs=1e-6)  # a step of 64 bits since 1970 is 2.4e-7 s
 
 
 @pytest.mark.parametrize("kind", ["csv", "texts", "h5", "dates", "durations"])

@@ -22,7 +22,7 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 from nnap_em.data.dataset import Dataset, pad
-from nnap_em.data.rig import HELD, SMOOTH, Declared, Rig
+from nnap_em.data.rig import HOLD, SMOOTH, Declared, Rig
 from nnap_em.fit.identify import friction_table, identify, parameter_table
 
 DT, ROWS, LOGS = 0.04, 300, 5
@@ -99,7 +99,7 @@ def main() -> None:
     """Run the study and print its table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=10)
-    parser.add_argument("--hold", nargs="+", default=[HELD, SMOOTH], choices=(HELD, SMOOTH))
+    parser.add_argument("--hold", nargs="+", default=[HOLD, SMOOTH], choices=(HOLD, SMOOTH))
     args = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     print(

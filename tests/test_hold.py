@@ -11,7 +11,7 @@ from scipy.integrate import solve_ivp
 from scipy.signal import lsim
 
 from nnap_em.data.dataset import Dataset, pad
-from nnap_em.data.rig import HELD, SMOOTH, read_rig, write_rig
+from nnap_em.data.rig import HOLD, SMOOTH, read_rig, write_rig
 from nnap_em.effects import catalogue
 from nnap_em.em.build import build_system
 from nnap_em.fit.check import late
@@ -122,7 +122,7 @@ def _rig(tmp_path, hold):
     slide = (
         'type = "slide"\nm = { mean = 2.0, std = 0.2 }\nfriction = "unknown"\n[input]\ncolumns = ["u"]\njoints = [1]'
     )
-    (tmp_path / "rig.toml").write_text(rig_text(slide, ["x"], 0.04).replace(HELD, hold))
+    (tmp_path / "rig.toml").write_text(rig_text(slide, ["x"], 0.04).replace(HOLD, hold))
     return read_rig(tmp_path / "rig.toml", specs)
 
 
@@ -146,7 +146,7 @@ def _recordings(force, rng, delay=0.0):
     return pad([one() for _ in range(4)])
 
 
-FORCES = {HELD: lambda smooth, t: smooth(0.04 * np.floor(t / 0.04 + 1e-9)), SMOOTH: lambda smooth, t: smooth(t)}
+FORCES = {HOLD: lambda smooth, t: smooth(0.04 * np.floor(t / 0.04 + 1e-9)), SMOOTH: lambda smooth, t: smooth(t)}
 
 
 @pytest.mark.parametrize("true", FORCES)
@@ -155,7 +155,7 @@ def test_torque_and_motion_show_the_hold(true, declared, tmp_path):
     """They differ by half a row; the line to write is the hold of the truth, and nothing where it is declared."""
     rig = _rig(tmp_path, declared)
     found = lag(regression(rig, build_system(rig), _recordings(FORCES[true], np.random.default_rng(3))), 0)
-    expected = {(HELD, SMOOTH): -0.5, (SMOOTH, HELD): 0.5}.get((declared, true), 0.0)
+    expected = {(HOLD, SMOOTH): -0.5, (SMOOTH, HOLD): 0.5}.get((declared, true), 0.0)
     assert abs(found.rows - expected) < 0.05 and found.std < 0.03
     assert found.counts == (true != declared)
     assert not found.counts or f'input_hold = "{true}"' in late(rig, found)

@@ -271,7 +271,8 @@ def test_every_shared_rig_is_read_and_written_back(shared, tmp_path):
     assert paths
     for path in paths:
         rig = read_rig(path, specs)
-        assert rig.name == path.parent.name or path.with_name("expected.txt").exists()  # logs of strangers
+        called = rig.name.replace(" ", "_") == path.parent.name
+        assert called or path.with_name("expected.txt").exists()  # logs of strangers
         for model in (*path.parent.glob("*.xml"), *path.parent.glob("*.urdf")):
             shutil.copy(model, tmp_path)
         write_rig(rig, tmp_path / "rig.toml")

@@ -50,7 +50,7 @@ _HINTS = {  # how the line of a key or table should look
 }
 
 
-HELD, SMOOTH = "zero-order", "first-order"
+HOLD, SMOOTH = "zero-order", "first-order"
 """Holds of inputs: commands stay until the next row; measured signals go on from row to row."""
 
 
@@ -127,7 +127,7 @@ class Rig:
     equations: str = ""  # of a plant that is written as equations: all of them, as `equations.Text.packed` writes them
     ranges: Mapping[str, tuple[float, float]] = dataclasses.field(default_factory=dict)  # ends of sensors: not read
     horizon: float | None = None  # s; how far predictions are used, of equations; None: by their time constants
-    input_hold: str = HELD  # or SMOOTH
+    input_hold: str = HOLD  # or SMOOTH
     file: str = dataclasses.field(default="", compare=False)  # MJCF of the machine, with shapes: to be written back
 
     @property
@@ -238,7 +238,7 @@ def read_rig(path: Path | str, systems: Mapping[str, SystemSpec]) -> Rig:
         input_joints=declaration.input_joints,
         dt=sampling.positive("dt"),
         clock=sampling.choice("clock", clocks),
-        input_hold=sampling.choice("input_hold", (HELD, SMOOTH)),
+        input_hold=sampling.choice("input_hold", (HOLD, SMOOTH)),
         measured=measured,
         noise_std=noise_std,
         start={state: start.declared(state) for state in start.items},

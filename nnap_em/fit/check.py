@@ -12,7 +12,7 @@ from jaxtyping import Float, Int, PRNGKeyArray
 from ..data.dataset import Array, Dataset
 from ..data.logs import REPEAT, Logs, logs_of_arrays
 from ..data.noise import reading_noise, resolution
-from ..data.rig import HELD, SMOOTH, Rig, RigError
+from ..data.rig import HOLD, SMOOTH, Rig, RigError
 from ..data.servo import TORQUE
 from ..em.build import LAG, NO_MACHINE, Scales, build_system, measure_scales
 from ..em.equations import infinite_rates, motion
@@ -359,7 +359,7 @@ def dynamics(rig: Rig, system: AbstractSystem, data: Dataset) -> Iterator[CheckR
 
 def late(rig: Rig, when: Lag) -> str:
     """An input that acts at another time than its hold has it, and the line to write."""
-    other, between = (SMOOTH, -0.5) if rig.input_hold == HELD else (HELD, 0.5)
+    other, between = (SMOOTH, -0.5) if rig.input_hold == HOLD else (HOLD, 0.5)
     kind = "a measured signal, which is not held" if other == SMOOTH else "a command that is held"
     side = f"{abs(when.rows):.2g} +- {when.std:.1g} rows {'later' if when.rows > 0 else 'earlier'}"
     text = f"torque and motion agree best if it acts {side} than `input_hold` has it ({when.rows * rig.dt:.2g} s)"

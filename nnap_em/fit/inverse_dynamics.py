@@ -22,7 +22,7 @@ from scipy.optimize import least_squares
 
 from ..data.dataset import Dataset
 from ..data.noise import reading_noise
-from ..data.rig import HELD, SMOOTH, Rig
+from ..data.rig import HOLD, SMOOTH, Rig
 from ..em.scale import not_identifiable
 from ..em.servos import build_servos
 from ..model import hooks
@@ -58,10 +58,10 @@ UNIT_FACTOR = 1.5
 """Factor from which on a torque is in another unit; less may be the gain of a motor, or a mass."""
 
 
-TRIANGLE = {HELD: (0.5, 0.5, 0.0), SMOOTH: (1 / 12, 5 / 6, 1 / 12)}
+TRIANGLE = {HOLD: (0.5, 0.5, 0.0), SMOOTH: (1 / 12, 5 / 6, 1 / 12)}
 """Weights of the row before, a row and the next in the force in a second difference, a mean over both intervals
 with a triangle as its weight: of inputs that are held, and of smooth ones [Numerov 1924]."""
-BLOCKS = 20
+ERROR_BLOCKS = 20
 """Blocks of rows whose errors are taken as independent."""
 LATE, SURE_LAG, WITHOUT_LAG = 0.25, 5.0, 0.75
 """Lag that counts [rows, and its standard deviations], and share of the unexplained squared torque that it leaves.
@@ -330,7 +330,7 @@ def lag(problem: Regression, i: int) -> Lag:
     moved = 0.5 * (misfits[best - 1] - misfits[best + 1])
     size = float(moved @ moved) + 1e-300
     rows = float(moved @ misfits[best]) / size
-    blocks = np.array_split(moved * (misfits[best] - rows * moved), BLOCKS)
+    blocks = np.array_split(moved * (misfits[best] - rows * moved), ERROR_BLOCKS)
     std = math.sqrt(sum(float(block.sum()) ** 2 for block in blocks)) / size
     remains = float(np.sum((misfits[best] - rows * moved) ** 2) / np.sum(misfits[REACH] ** 2))
     return Lag(shifts[best] + rows, std, remains)

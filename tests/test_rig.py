@@ -271,8 +271,8 @@ def test_every_shared_rig_is_read_and_written_back(shared, tmp_path):
     assert paths
     for path in paths:
         rig = read_rig(path, specs)
-        called = rig.name.replace(" ", "_") == path.parent.name
-        assert called or path.with_name("expected.txt").exists()  # logs of strangers
+        free = path.with_name("expected.txt").exists() or path.parents[1].name == "ode"  # strangers call theirs so
+        assert rig.name == path.parent.name or free
         for model in (*path.parent.glob("*.xml"), *path.parent.glob("*.urdf")):
             shutil.copy(model, tmp_path)
         write_rig(rig, tmp_path / "rig.toml")

@@ -76,7 +76,8 @@ def write_diagnosis(
     designed = [command] if diagnosis.before.rig.input_columns and not diagnosis.before.rig.equations else []
     document = shared(diagnosis.before, train, test, seed=seed, began=began) | {
         "verdict": " ".join([outcome, *[misfit.text] * bool(misfit.text), *(one.sentence for one in far)]),
-        "misfit": {name: fitted.misfit.document for name, fitted in both.items()},
+        "misfit": [misfit.text] if misfit.useless else [],
+        "accuracy": {name: fitted.misfit.document for name, fitted in both.items()},
         "moved": far,
         "complete": diagnosis.complete,
         "since_fit": {"risen": diagnosis.risen} if diagnosis.change else None,

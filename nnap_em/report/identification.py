@@ -78,7 +78,8 @@ def write_identification(
     entries = [{**epoch, "left_out": [train.files[i] for i in epoch["left_out"]]} for epoch in epochs]
     document = shared(fitted, train, test, seed=seed, began=began) | {
         "verdict": _verdict(fitted, len(train.files), len(entries[-1]["left_out"]), causes, far),
-        "misfit": misfit.document,
+        "misfit": [misfit.text, *causes] if misfit.useless else [],
+        "accuracy": misfit.document,
         "moved": far,
         "fit": error and {name: error[name] for name in ("given_s", "horizons_s")} | error["fit"],
         "error": error,
@@ -131,7 +132,7 @@ def _stopped_early(fitted: Identified) -> str:
 
 
 def _log_summary(document: dict[str, Any], log: Log) -> None:
-    if document["misfit"]["text"] or document["moved"]:
+    if document["accuracy"]["text"] or document["moved"]:
         log(document["verdict"])
     for law in document["friction_law"] or []:
         log(law["text"])

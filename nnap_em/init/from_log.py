@@ -197,7 +197,7 @@ def sampling(table: Mapping[str, np.ndarray], columns: Sequence[_Column]) -> Ite
     else:
         between = f"{np.min(steps):.3g} to {np.max(steps):.3g} s" if time else "no time"
         yield f"# dt = ...    # s; the rows of this log are {between} apart: resample it to uniform rows"
-    yield 'input_hold = "zero-order"'
+    yield 'input_hold = "zero-order"    # of commands; "first-order" of a measured torque, current or force'
     clock = "sequence" if abs(t[0]) <= 0.01 * max(dt, 0.0) else "session"
     yield f'clock = "{clock}"    # "sequence": time starts at 0 in each file; "session": it runs on over all files'
 

@@ -372,6 +372,12 @@ def test_commands_sent_on_change_are_known_by_their_times_and_values(t, y, on_ch
     assert sent_on_change(Signal("", t, y[: t.size]), DT) == on_change
 
 
+@pytest.mark.parametrize("dt, on_change", [(15.0, False), (0.1, True)], ids=["a row each", "many rows"])
+def test_commands_of_a_slow_plant_are_a_stream(dt, on_change):
+    """Every 15 s: a value in each row of a heater, or set points of a drive."""
+    assert sent_on_change(Signal("", 15.0 * np.arange(240.0), np.tile([0.0, 40.0], 120)), dt) == on_change
+
+
 def test_an_input_that_is_silent_alone_is_seen(tmp_path):
     """Two inputs of one table with as many values each, of which one is silent for 3 s."""
     half, silent = np.full((2, T.size), np.nan), (T >= 4) & (T < 7)

@@ -56,7 +56,8 @@ def in_unit(path: Path, column: str, at: Address, rig: Rig) -> tuple[Address, st
     if times is not None and not math.isnan(times):
         return at._replace(scale=times), f"{column} from {str(at)!r}: {times:.6g} {unit} per {named}" * (times != 1)
     other = re.search(r"\s[\[(]([^][()]+)[\])]$", at.path) if at.scale is None and unit and not named else None
-    note = f"{column} from {str(at)!r}: taken in {unit}, since the unit {other[1]!r} is not known" if other else ""
+    odd = other[1] if other and other[1] != unit else ""
+    note = f"{column} from {str(at)!r}: taken in {unit}, since the unit {odd!r} is not known" if odd else ""
     return at._replace(scale=at.scale or 1.0), note
 
 

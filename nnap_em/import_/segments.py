@@ -52,8 +52,8 @@ def sent_on_change(signal: Signal, dt: float) -> bool:
     """
     steps = np.diff(signal.t)
     fewest_intervals = 10  # intervals between commands from which on they may have a rate
-    # Median interval from which on commands are set points [s]: no drive waits so long for the next one of a stream
-    if steps.size < fewest_intervals or signal.interval >= 0.5:
+    # Median interval from which on commands are set points [s], if it is more than a row: no drive waits so long
+    if steps.size < fewest_intervals or signal.interval >= max(0.5, 1.5 * dt):
         return True
     usual = np.mean((steps >= 0.5 * signal.interval) & (steps <= 1.5 * signal.interval))
     alike = np.mean((steps[1:] >= steps[:-1] / 1.5) & (steps[1:] <= 1.5 * steps[:-1]))  # of a stream whose rate changes

@@ -64,7 +64,7 @@ def measured(system: AbstractSystem, rounds: int) -> tuple[float, float]:
     def slopes(x):
         return *x[dof:], *system.acceleration(x[:dof], x[dof:], jnp.zeros(dof))
 
-    step = jax.jit(jax.vmap(lambda x: integrate(lambda x, _: slopes(x), x, 0.01, 1)))
+    step = jax.jit(jax.vmap(lambda x: integrate(slopes, x, 0.01, 1)))
     x = jnp.asarray(np.random.default_rng(0).uniform(-1.0, 1.0, (STATES, 2 * dof)))
     times = []
     for _ in range(rounds + 1):

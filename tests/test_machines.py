@@ -21,7 +21,6 @@ from nnap_em.data.rig import Declared, RigError, RigWarning, read_rig
 from nnap_em.effects import catalogue
 from nnap_em.em.build import build, build_system
 from nnap_em.em.prior import ParameterPrior
-from nnap_em.experiment.criteria import Information
 from nnap_em.experiment.experiment import Design
 from nnap_em.experiment.information import Fit
 from nnap_em.fit.identifiability import identifiability, sentences
@@ -280,7 +279,7 @@ def test_a_design_calls_numbers_of_a_file_and_of_effects_by_name_and_unit(tmp_pa
     prior = ParameterPrior(("link2.mass", "0.delay"), jnp.asarray([2.0, 0.0]), jnp.asarray([0.1, 0.01]))
     system = build_system(rig)
     model = SimpleNamespace(system=system, effects=(late,), parameter=system.parameter)
-    information = Information(np.zeros((4, 4)))
+    information = np.zeros((4, 4))
     fit = Fit(model, prior, jnp.zeros((2, 1)), jnp.eye(4), jnp.eye(4))
     design = Design(**dict.fromkeys(Design._fields))  # type: ignore[arg-type]
     design = design._replace(fit=fit, fitted=SimpleNamespace(rig=rig), expected=information, old=information)

@@ -68,7 +68,7 @@ def _columns(base: StateSpaceModel, effect: AbstractEffect, track: Track, scenes
     driven = scenes._replace(drive=drive)
 
     def remember(m, scene):
-        return integrate(lambda m, _: hooks.drift(alone, _scene(base, scene), m), m, base.dt, substeps), m
+        return integrate(lambda m: hooks.drift(alone, _scene(base, scene), m), m, base.dt, substeps), m
 
     memory = jnp.zeros((track.middle.shape[0], effect.memory), track.middle.dtype)
     if effect.memory:

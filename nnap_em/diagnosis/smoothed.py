@@ -76,8 +76,8 @@ def extended(model: StateSpaceModel, path: Gaussian, data: Dataset) -> Gaussian:
     def one(mean, cov, seq):
         def step(m, slices):
             x, u = slices
-            memory_rate = lambda m, part: model.rate(jnp.concatenate([x, m]), u.at(part), still)[width:]  # noqa: E731
-            return integrate(memory_rate, m, model.dt, model.steps), m
+            memory_rate = lambda m, part=0.0: model.rate(jnp.concatenate([x, m]), u.at(part), still)[width:]  # noqa: E731
+            return integrate(memory_rate, m, model.dt, model.steps, timed=model.smooth), m
 
         _, memory = jax.lax.scan(step, model.start.mean[width:], (mean, model.inputs(seq)))
         wide = jnp.zeros((mean.shape[0], states, states), cov.dtype)

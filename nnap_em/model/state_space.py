@@ -154,7 +154,8 @@ class StateSpaceModel(AbstractModel):
     ) -> Float[Array, " state"]:
         """Mean of the state one sample later."""
         extra = jnp.zeros(len(self.system.ports), x.dtype) if force is None else force
-        return integrate(lambda x, part: self.slopes(x, u.at(part), extra), x, self.dt, self.steps)
+        slopes = lambda x, part=0.0: self.slopes(x, u.at(part), extra)  # noqa: E731
+        return integrate(slopes, x, self.dt, self.steps, timed=self.smooth)
 
     def resolved(self) -> "StateSpaceModel":
         """This model with the integration steps that its friction requires, a power of two: programs are shared.
@@ -213,7 +214,8 @@ class StateSpaceModel(AbstractModel):
             before, reach = u._replace(u=u.before, course=along), jnp.minimum(delay, u.age)
             still, back = jnp.zeros(len(self.system.ports), x.dtype), reach / self.dt
             at = lambda part: before.at(jnp.maximum(1 - part * back, 0.0))  # noqa: E731
-            ago = integrate(lambda x, part: -reach * self.rate(x, at(part), still), x, 1.0, 3)
+            slopes = lambda x, part=0.0: -reach * self.rate(x, at(part), still)  # noqa: E731
+            ago = integrate(slopes, x, 1.0, 3, timed=along is not None)
             return self.true(ago, at(1.0), force)
 
         return hooks.read(self.effects, names, self.true(x, u, force), past)

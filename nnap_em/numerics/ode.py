@@ -54,25 +54,29 @@ class RK4(diffrax.AbstractSolver):
 
 
 def integrate(
-    rate: Callable[[Float[Array, " state"], Float[Array, ""]], Float[Array, " state"] | Sequence[Float[Array, ""]]],
+    rate: Callable[..., Float[Array, " state"] | Sequence[Float[Array, ""]]],
     x: Float[Array, " state"],
     dt: float,
     substeps: int,
+    *,
+    timed: bool = False,
 ) -> Float[Array, " state"]:
-    """State after `dt` [s] of x' = rate(x, s), by `substeps` equal steps of `RK4`; s goes from 0 to 1 in that time.
+    """State after `dt` [s] of x' = rate(x), by `substeps` equal steps of `RK4`; `timed`: of x' = rate(x, s), where s
+    goes from 0 to 1 in that time.
 
     A rate may be handed over entry by entry: an array of many joints' accelerations is computed anew for every entry
     that is read.
     """
     solver = RK4()
-    term = diffrax.ODETerm(lambda t, y, step: tuple(rate(jnp.stack(y), (step + t / h) / substeps)))
+    at = lambda t, step: ((step + t / h) / substeps,) if timed else ()  # noqa: E731
+    term = diffrax.ODETerm(lambda t, y, step: tuple(rate(jnp.stack(y), *at(t, step))))
     zero, h = jnp.zeros((), x.dtype), jnp.asarray(dt / substeps, x.dtype)
 
     def body(x, step):
         x, *_ = solver.step(term, zero, h, x, step, None, made_jump=False)
         return x, None
 
-    entries, _ = jax.lax.scan(body, tuple(x), jnp.arange(substeps, dtype=x.dtype))
+    entries, _ = jax.lax.scan(body, tuple(x), jnp.arange(substeps, dtype=x.dtype) if timed else None, length=substeps)
     return jnp.stack(entries)
 
 

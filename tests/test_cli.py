@@ -214,7 +214,7 @@ def test_results_that_will_be_replaced_are_named_before(bench, tmp_path, monkeyp
     name = command.__name__.rpartition(".")[2]
     for _ in range(2):
         assert nnap(name, bench, "--out", tmp_path) == 2
-        (tmp_path / file).touch()
+        (tmp_path / file).write_bytes(b'"kind": "nnap_em fit"')
     first, replaced, second = capsys.readouterr().err.splitlines()
     assert re.fullmatch(rf"nnap-em: the (fit|diagnosis) in {tmp_path} will be replaced", replaced)
     assert first == second == "nnap-em: error: the fit would begin here"

@@ -382,7 +382,7 @@ def _finished(monkeypatch, error, white=False):
         return each[:, None, None, None] * np.array([0.9, 1.0, 1.1])[None, :, None, None]
 
     fakes = {"white_readings": lambda *_: white, "not_diverged": lambda *_: used, "finish": finish, "errors": errors}
-    fakes["followed"] = _followed
+    fakes |= {"followed": _followed, "ahead": lambda *_: ()}
     fakes["e_step"] = lambda model, *_, **__: SimpleNamespace(state=PATH, loglik=np.full(4, _mass(model)))
     fakes["widened"] = lambda *args, key: stated.Stated(2 * args[-1], 0.7)
     for name, value in fakes.items():

@@ -160,7 +160,7 @@ ORDER = {
     "diagnosis": (
         WHOLE,
         "The model lacks a spring. | 0.81 → 0.0058 rad | 139 × | What was found | 0.05995 ± 0.00037 N m/rad | "
-        "Beyond doubt. It raises the log-likelihood of the training data by 1142 nat. On parts left out | "
+        "Beyond doubt. It raises the log-likelihood of the training data by 1142 nat. | "
         "Before and after | 1.5 × larger | "
         "1 failed before and none fails after (not counting 1 and none | Friction was bent. | "
         "hard stop at joint 1 | Unhook the cable. | Details | ✗ fails | cogging at joint 1 | 172 s",

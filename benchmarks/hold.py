@@ -27,7 +27,7 @@ from nnap_em.fit.identify import friction_table, identify, parameter_table
 
 DT, ROWS, LOGS = 0.04, 300, 5
 SPEEDS = np.array([-0.9, -0.6, -0.3, 0.3, 0.6, 0.9])
-"""Where friction is compared [largest speed]."""
+"""Speeds at which friction is compared [largest speed]."""
 
 
 class Machine(NamedTuple):

@@ -158,7 +158,7 @@ NAMED = {  # the column and its name in the log, mapped as it stands; how many S
 
 @pytest.mark.parametrize("column, name, size", NAMED.values(), ids=NAMED)
 def test_a_unit_in_the_name_of_a_mapped_column_scales_it_or_is_refused(tmp_path, column, name, size):
-    """Where the mapping has a scale, that counts."""
+    """A scale in the mapping counts instead of the unit in the name."""
     names = {"theta1": "theta1", "dtheta1": "dtheta1", "u": "u"} | {column: name}
     log = dialects.table(tmp_path / "a.csv", ",".join(["time", names["u"], names["theta1"], names["dtheta1"]]), COLUMNS)
     place = ["u", "theta1", "dtheta1"].index(column)

@@ -298,7 +298,7 @@ ODD = ("joint 1 [rad]", "a.b", 'Gelenk ä"', "limits", "x#y", "-", "1")
 
 @pytest.mark.parametrize("name", ODD)
 def test_a_name_of_any_letters_comes_back(tmp_path, name):
-    """Of states, readings, inputs, limits and parameters."""
+    """Names of states, readings, inputs, limits and parameters come back as they are."""
     rig = Rig(
         name=name, system="odd", friction=True,
         parameters={f"{name}.mass": Declared(1.0, 0.1), f"{name}.mass of it": Declared(1.0, 0.0)},

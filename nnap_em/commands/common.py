@@ -187,7 +187,7 @@ def own_logs(args: argparse.Namespace, stored: Stored, log: Log) -> Dataset | No
         return None
 
 
-def warn_of_torques(folder: Path, bench: Bench) -> None:
+def warn_of_logs(folder: Path, bench: Bench) -> None:
     """Warn where rates are not those of their coordinates, or inputs cannot be those of the declared bodies.
 
     Raises DataError where rates of equations are infinite.

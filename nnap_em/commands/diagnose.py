@@ -32,7 +32,7 @@ from .common import (
     read_bench,
     remove_reports,
     resumable,
-    warn_of_torques,
+    warn_of_logs,
 )
 
 
@@ -44,7 +44,7 @@ def run(args: argparse.Namespace, log: Log) -> int:
     search_share = 0.8
     seconds = search_share * 60.0 * args.minutes if args.minutes else math.inf
     bench = read_bench(args.folder, args.trust_readings, args.more)
-    warn_of_torques(args.folder, bench)
+    warn_of_logs(args.folder, bench)
     check_out(args.out)
     start = origin(args, bench, log)
     own = start and own_logs(args, start, log)

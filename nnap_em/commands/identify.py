@@ -31,14 +31,14 @@ from ..fit.store import MODEL_FILE, fingerprint, save
 from ..report.identification import write_identification
 from ..storage.log import Log
 from .cli import SMOOTHERS
-from .common import MISFIT_STATUS, check_out, logs_at, origin, read_bench, remove_reports, resumable, warn_of_torques
+from .common import MISFIT_STATUS, check_out, logs_at, origin, read_bench, remove_reports, resumable, warn_of_logs
 
 
 def run(args: argparse.Namespace, log: Log) -> int:
     """Fit, and report; the test logs serve for the reported error alone."""
     began = time.perf_counter()
     bench = read_bench(args.folder, args.trust_readings, args.more)
-    warn_of_torques(args.folder, bench)
+    warn_of_logs(args.folder, bench)
     check_out(args.out)
     if (args.out / MODEL_FILE).exists():
         log(f"the fit in {args.out} will be replaced")

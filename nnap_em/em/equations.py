@@ -23,7 +23,7 @@ from ..numerics.parallel import each
 from ..systems.equations import Equations
 from .prior import ParameterPrior
 from .readings import reading_noise
-from .simulated import followed
+from .simulated import filter_path
 
 
 class Motion(NamedTuple):
@@ -109,7 +109,7 @@ def motion(model: StateSpaceModel, data: Dataset) -> Motion:
 
     A free simulation would rest where the equations do, and leave where they are unstable or wrong.
     """
-    path, step, _ = (np.asarray(a) for a in each(followed, model, jax.device_put(data)))
+    path, step, _ = (np.asarray(a) for a in each(filter_path, model, jax.device_put(data)))
     valid, count = np.asarray(data.valid), len(model.system.states)
     seen = _along(model.system, path[valid], np.asarray(data.u)[valid])
     width = np.std(seen.x[:, :count], axis=0) if len(seen.x) else np.ones(count)

@@ -97,12 +97,12 @@ class Simulated(NamedTuple):
 
 def filtered(model: StateSpaceModel, data: Dataset) -> Starts:
     """Starts of all windows by the filter of a model."""
-    path = np.asarray(each(followed, model, jax.device_put(data))[0])
+    path = np.asarray(each(filter_path, model, jax.device_put(data))[0])
     width = np.sqrt(np.mean(path[np.asarray(data.valid)] ** 2, axis=0))
     return Starts(path[:, windows(model, data).row[:, 0]], width + 1e-9)
 
 
-def followed(model: StateSpaceModel, seq: Dataset):
+def filter_path(model: StateSpaceModel, seq: Dataset):
     """States that the filter of a model has along a sequence, its Jacobians of the next state and of the reading."""
     out = ekf(model, model.start, prepare(model, seq), TANGENT)
     return out.state.mean, out.affine.matrix, out.reading.rows

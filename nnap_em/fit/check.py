@@ -19,7 +19,7 @@ from ..em.equations import infinite_rates, motion
 from ..em.readings import onset
 from ..em.scale import not_identifiable
 from ..em.servos import build_servos, steps_of_sample
-from ..em.simulated import followed, windows
+from ..em.simulated import filter_path, windows
 from ..model.base import prepare
 from ..model.friction import NoFriction
 from ..model.state_space import MOST_STEPS, StateSpaceModel
@@ -162,7 +162,7 @@ def _equations(rig: Rig, problem: Identified, data: Dataset) -> Iterator[CheckRe
     at = windows(model, data)  # a start that nothing shows, as at rest, is one of many
     place = at.rows * np.arange(at.count)[:, None] + np.arange(at.rows)
     cut = lambda part: np.asarray(part)[:, place].reshape(-1, at.rows, *part.shape[2:])  # noqa: E731
-    along = Along(*map(cut, each(followed, model, jax.device_put(data))))
+    along = Along(*map(cut, each(filter_path, model, jax.device_put(data))))
     yield from _observability(model, along, cut(data.valid), at.rows)
 
 
@@ -349,7 +349,7 @@ def dynamics(rig: Rig, system: AbstractSystem, data: Dataset) -> Iterator[CheckR
         slopes = zip(rig.input_columns, gains(problem), strict=True)
         kinds = enumerate(rig.kinds.items())
         lags = {name: lag(problem, i) for i, (name, kind) in kinds if kind == TORQUE}
-        late_by = {name: f", {when} rows late" for name, when in lags.items()}
+        late_by = {name: f", {when} rows late" for name, when in lags.items() if np.isfinite(when.std)}
         text += "".join(f"; {name}: slope {slope:.3g}{late_by.get(name, '')}" for name, slope in slopes)
         yield CheckResult(OK, "dynamics", text)
         yield from (

@@ -231,7 +231,7 @@ def search_equations(before: Identified, data: Dataset, log: Log, until: float =
         if chosen is None:
             break
         for law, effect in zip(chosen.laws, chosen.effects, strict=True):
-            record = Evidence(equivalent=alike, share=chosen.share, chance=chosen.share)
+            record = Evidence(equivalent=alike, share=chosen.share, removed=chosen.share)
             hypothesis = hypothesis.plus(effect, law, record)
             log(f"  added {words(key_of(effect))}")
         hypothesis = hypothesis.refitted(_with_numbers(hypothesis, chosen))

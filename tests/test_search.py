@@ -441,7 +441,7 @@ def test_external_disturbances_are_sought_where_noise_is_not_what_the_model_says
 
 @pytest.mark.parametrize(("channel", "left", "stays"), [("dx", 0.91, False), ("dx", 0.90, True), ("x", 0.1, False)])
 def test_a_law_of_a_rate_is_judged_by_that_reading_too(monkeypatch, channel, left, stays):
-    """The law removes 5 % of the coordinate's errors: a late rate counts little once noise was fitted without it."""
+    """Of the errors of x the law removes 5 %: a late rate counts little where noise was fitted without its law."""
     law = catalogue["sensor_delay"](jnp.asarray(0.07), channel=channel)
     _pretend(monkeypatch, {})
     ratio = lambda self, null, full, fit, band, see=(): left if see == (1,) else 0.95  # noqa: E731

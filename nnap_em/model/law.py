@@ -46,12 +46,13 @@ LAW_UNITS = {True: ("N m", "N m", "rad/s", "N m s/rad", "rad/s", "N m"), False: 
 """Units of PARAMETERS, by whether the coordinate is an angle."""
 
 
-ROWS = 2
-"""Rows from rest to the Stribeck velocity, and to the velocity over which the sign changes, from which on they and the
-breakaway torque are stated: a row shows the mean of friction over what it passes, a shape needs two.
+CROSSED = 2
+"""Multiple of the Stribeck velocity, and of that over which the sign changes, from which on a change of velocity in one
+row passes all of its range, from one side of rest to the other: they and the breakaway torque are then not stated.
 
-Of 46 sets of logs of a slide and a pendulum 29 of 39 breakaway torques lay within two standard deviations, the worst 11
-away; with two rows all of 5 that are stated. With one row 6 of 10 on 28 of the sets, with 1.5 rows 3 of 3.
+Of 46 sets of logs of a slide and a pendulum in code of their own 40 breakaway torques would be stated, 31 of them
+within two standard deviations, the worst 11 away; with this 29 are, 24 within. The other 5 are of one slow slide at
+40 ms: friction is evaluated once in a row of a fit, and their bands are too narrow.
 """
 
 
@@ -87,8 +88,8 @@ def fit_law(
         value = argmin |L^-1 (torque - law)|^2,  L L' = cov + nugget,  std by draws from the posterior
 
     The nugget (a tenth of the torque's standard deviation, half a percent of its range) is what the shape of the
-    learned curve itself may err where its covariance is all but singular. NaN is what may, within two standard
-    deviations, be fewer than `ROWS` from rest, by the speed that is `passed` in one.
+    learned curve itself may err where its covariance is all but singular. NaN is what rows cross (`CROSSED`), by the
+    speed that is `passed` in one.
     """
     passed = np.zeros(len(velocity)) if passed is None else passed
     joints = [_fit_joint(*map(np.asarray, table)) for table in zip(velocity, torque, cov, passed, strict=True)]
@@ -203,7 +204,7 @@ def _fit_joint(
     draws, value = posterior.natural(draws), posterior.natural(places[0])
     std = 0.5 * np.quantile(np.abs(draws - value), 0.9545, axis=0)  # of a normal distribution within two
     unexplained = np.diag(cov) - np.var(curve(draws[::48].T[..., None], v), axis=0)
-    difference, fast = torque - curve(value, v), (passed > 0) & (value - 2 * std < ROWS * passed)
+    difference, fast = torque - curve(value, v), CROSSED * value < passed
     value, std = (np.where(fast[[0, 2, 2, 0, 4, 0]] & SHAPE, np.nan, number) for number in (value, std))
     return LawFit(value, std, v, difference, np.sqrt(np.maximum(unexplained, least)), passed)
 

@@ -275,7 +275,7 @@ def light(place, beside, designed, monkeypatch):
         monkeypatch.setattr(identify, name, bound(getattr(identify, name), fitted))
     monkeypatch.setattr(identify, "write_identification", bound(identify.write_identification, lambda _: True))
     monkeypatch.setattr(diagnose, "diagnose", bound(diagnose.diagnose, lambda _: Diagnosis(fit, fit, (), ())))
-    monkeypatch.setattr(diagnose, "write_diagnosis", bound(diagnose.write_diagnosis, lambda _: None))
+    monkeypatch.setattr(diagnose, "write_diagnosis", bound(diagnose.write_diagnosis, lambda _: True))
     monkeypatch.setattr(compare, "compare", beside)
     monkeypatch.setattr(design, "design", bound(experiment.design, lambda o: _first(designed, o["sequences"])))
     monkeypatch.chdir(place)

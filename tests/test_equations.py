@@ -25,7 +25,7 @@ from nnap_em.fit import identify as identification
 from nnap_em.fit.check import check
 from nnap_em.fit.identify import begin, identify, parameter_table
 from nnap_em.fit.store import load, save
-from nnap_em.model.hooks import reaching
+from nnap_em.model.hooks import Sampling, reaching
 from nnap_em.model.state_space import Inputs
 from nnap_em.systems import Equations, register_equations, specs
 from nnap_em.systems.expression import FormulaError, parse
@@ -441,13 +441,13 @@ def test_an_input_that_takes_time_begins_as_it_is(tmp_path):
     system = build_system(_rig(tmp_path))
     column = jnp.asarray(data.u)[0, :, 0]
     lag = catalogue["actuator_lag"].of(2.0, channel="u")
-    late = np.asarray(reaching((lag,), system, column[:, None], 0.5))[:, 0]
+    late = np.asarray(reaching((lag,), system, column[:, None], Sampling(0.5)))[:, 0]
     keep, expected, held = np.exp(-0.5 / 2.0), [], float(column[0])
     for one in np.asarray(column):  # mean over each row of the exact response
         expected.append(one + (held - one) * 2.0 / 0.5 * (1 - keep))
         held = one + (held - one) * keep
     np.testing.assert_allclose(late, expected, rtol=1e-9)
-    np.testing.assert_array_equal(reaching((lag,), system, jnp.full((9, 1), 3.0), 0.5), 3.0)
+    np.testing.assert_array_equal(reaching((lag,), system, jnp.full((9, 1), 3.0), Sampling(0.5)), 3.0)
 
 
 def test_identify_finds_the_parameters_and_the_hidden_state(tmp_path):

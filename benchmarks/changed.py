@@ -41,6 +41,7 @@ from planted_cases import REST, case_of
 from planted_make import DATA, ROOT, make, needed, read
 from scipy.signal import savgol_filter
 
+from nnap_em.commands.common import MISFIT_STATUS
 from nnap_em.data.formats import write_csv
 from nnap_em.data.rig import Declared, write_rig
 from nnap_em.model.simulate import declared, examples, sweep_experiment
@@ -97,7 +98,7 @@ def planted(name: str, out: Path) -> dict[str, Any]:
         fit = fit_of(case_of(name).rig, out)
         halves(case, case / "rig.toml", half, True)
         status, spent, said = command("diagnose", half, "--from", fit, "--out", found)
-        report = json.loads((found / "report.json").read_text()) if status == 0 else None
+        report = json.loads((found / "report.json").read_text()) if status in (0, MISFIT_STATUS) else None
     record = {"case": name, "truth": truth, "seconds": spent, "processor_seconds": spent, "said": said}
     return record | ({"report": report} if report else {"failed": said})
 
@@ -126,7 +127,7 @@ def real(name: str, out: Path) -> dict[str, Any]:
         mean = np.concatenate([0.5 * (torque[:-1] + torque[1:]), torque[-1:]])
         write_csv(path, log | {f"tau{j}": log[f"tau{j}"] + mean[:, j - 1] for j in (1, 2)})
     status, spent, said = command("diagnose", half, "--from", fit, "--out", found)
-    report = json.loads((found / "report.json").read_text()) if status == 0 else None
+    report = json.loads((found / "report.json").read_text()) if status in (0, MISFIT_STATUS) else None
     return {"case": name, "moved": more[kind], "report": report, "seconds": spent, "said": said}
 
 
@@ -151,7 +152,7 @@ def loaded(name: str, out: Path) -> dict[str, Any]:
         torques = {drives[j]: log[drives[j]] + mean[:, i] for i, j in enumerate(joints)}
         write_csv(path, {n: log[n] for n in log.dtype.names} | torques)
     status, spent, said = command("diagnose", half, "--from", fit, "--out", found)
-    report = json.loads((found / "report.json").read_text()) if status == 0 else None
+    report = json.loads((found / "report.json").read_text()) if status in (0, MISFIT_STATUS) else None
     return {"case": name, "report": report, "seconds": spent, "said": said}
 
 
@@ -210,7 +211,7 @@ def moved(name: str, out: Path) -> dict[str, Any]:
     after, found = out / "sim" / name, out / "found" / name
     write(after, system, kind, 8, 300, 2 * int(seed) + 1)
     status, spent, said = command("diagnose", after, "--from", fit, "--out", found)
-    report = json.loads((found / "report.json").read_text()) if status == 0 else None
+    report = json.loads((found / "report.json").read_text()) if status in (0, MISFIT_STATUS) else None
     return {"case": name, "report": report, "seconds": spent, "said": said}
 
 

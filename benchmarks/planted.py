@@ -27,6 +27,7 @@ from planted_cases import CASES, split
 from planted_make import ROOT, make
 from planted_table import cases, score, table
 
+from nnap_em.commands.common import MISFIT_STATUS
 from nnap_em.storage.files import replace_text
 
 
@@ -55,7 +56,7 @@ def run(name: str, out: Path, limit: float) -> dict[str, Any]:
             last = (said.read().strip().splitlines() or [""])[-1]
         record["seconds"] = time.perf_counter() - began
         record["processor_seconds"] = _processor() - spent
-        if status == 0:
+        if status in (0, MISFIT_STATUS):
             record["report"] = json.loads((result / "report.json").read_text())
         else:
             record["failed"] = status if isinstance(status, str) else f"status {status}: {last}"

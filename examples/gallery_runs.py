@@ -18,6 +18,7 @@ import numpy as np
 
 from nnap_em import friction_table, identify, read_logs, read_rig
 from nnap_em.commands.cli import main as nnap_em
+from nnap_em.commands.common import MISFIT_STATUS
 from nnap_em.diagnosis.interventions import WINDOWS, averaged
 from nnap_em.diagnosis.residual import residual
 from nnap_em.diagnosis.undisturbed import disturbance_free
@@ -32,7 +33,7 @@ Arrays = Mapping[str, Any]
 
 
 def _command(*words: object) -> None:
-    if status := nnap_em([*map(str, words)]):
+    if (status := nnap_em([*map(str, words)])) not in (0, MISFIT_STATUS):
         raise RuntimeError(f"nnap-em {words[0]} ended with {status}")
 
 

@@ -15,6 +15,7 @@ from nnap_em.diagnosis.findings import Estimate, Finding, verdict
 from nnap_em.effects import catalogue
 from nnap_em.effects.base import Curve
 from nnap_em.effects.function import Axis
+from nnap_em.numerics.profile import profiling
 
 SLIDE = plant.Case(system="slide", sequences=8, tests=3, steps=250, seed=2, noise=(5e-4, 5e-3))
 SPRING = {"name": "torsional_spring", "joint": 1, "k": 20.0, "theta0": 0.05}
@@ -41,6 +42,15 @@ def test_a_slide_that_lacks_nothing_is_left_alone(tmp_path):
     again, _ = _closed(case, tmp_path)
     for a, b in zip(jax.tree.leaves(first.after.model), jax.tree.leaves(again.after.model), strict=True):
         np.testing.assert_array_equal(a, b)
+
+
+def test_other_recordings_of_the_machine_compile_nothing(tmp_path):
+    """Two more, three rows shorter: the programs of the search of the test before serve."""
+    case = SLIDE._replace(effects=(DRAG,))
+    _closed(case, tmp_path / "first")
+    with profiling() as profile:
+        _closed(case._replace(sequences=10, steps=247, seed=3), tmp_path / "second")
+    assert {name: stages for name, stages in profile.spent.items() if stages["compile"]} == {}
 
 
 @pytest.mark.slow

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from nnap_em.data.dataset import Dataset
+from nnap_em.data.dataset import Dataset, stepped
 from nnap_em.data.rig import Declared, Rig
 from nnap_em.fit.identify import Identified, begin, friction_table, phi_samples
 from nnap_em.fit.predict import Prediction, given_samples, horizon_errors, posterior_of, predict, smooth
@@ -92,7 +92,7 @@ def test_groups_of_sequences_change_nothing(monkeypatch):
     program = parallel._program
 
     def counted(function):
-        return lambda mesh, group, *arguments: groups.append(group) or program(function)(mesh, group, *arguments)
+        return lambda mesh, *rest: groups.append(len(jax.tree.leaves(rest[-1])[0])) or program(function)(mesh, *rest)
 
     monkeypatch.setattr(parallel, "_program", counted)
 
@@ -110,15 +110,15 @@ def test_groups_of_sequences_change_nothing(monkeypatch):
         np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-12)
 
 
-def test_the_program_of_larger_data_predicts_the_same():
+def test_rows_of_padding_predict_the_same():
     case = _case(q=1e-2, information=1e3)
-    key, (sequences, rows) = jax.random.key(5), case.data.t.shape
-    by_own, by_larger = (
-        predict(case.fitted, case.data, GIVEN, key=key, samples=5, shape=shape)
-        for shape in ((0, 0), (sequences + 2, rows + 7))
+    key, rows = jax.random.key(5), case.data.t.shape[1]
+    own, padded = (
+        predict(case.fitted, data, GIVEN, key=key, samples=5) for data in (case.data, stepped(case.data, 99))
     )
-    for own, larger in zip(by_own, by_larger, strict=True):
-        np.testing.assert_allclose(own, larger, rtol=1e-9, atol=1e-12)  # the same operations in another program
+    assert padded.mean.shape[1] == 104 and own.mean.shape[1] == rows
+    for a, b in zip(own, padded, strict=True):
+        np.testing.assert_allclose(a, np.asarray(b)[:, :rows], rtol=1e-9, atol=1e-12)  # the same in another program
 
 
 def test_std_grows_as_the_kicks_add_up():

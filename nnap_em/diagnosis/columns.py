@@ -1,7 +1,7 @@
 """Columns of candidates along the smoothed motion: force and reading of each of their probes."""
 
 import itertools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import jax
@@ -147,32 +147,28 @@ def blocks_of(candidates: Sequence[Candidate]) -> Blocks:
     return [[one for _, one in same] for _, same in itertools.groupby(numbered, lambda pair: pair[0])]
 
 
-def columns_by_block(base: StateSpaceModel, blocks: Blocks) -> Iterator[Callable[[Track], Columns]]:
-    """`candidate_columns` of each block, all of one size: columns of nothing fill the others up."""
-    size = max(sum(len(candidate.probes) for candidate in block) for block in blocks)
-    return (candidate_columns(base, block, size) for block in blocks)
-
-
 def candidate_columns(
-    base: StateSpaceModel, candidates: Sequence[Candidate], size: int = 0
+    base: StateSpaceModel, candidates: Sequence[Candidate], size: int = 0, rows: int = 0
 ) -> Callable[[Track], Columns]:
     """Columns that the probes of all candidates add to `base` along the tracks of some sequences: seq column time ...
 
-    They are padded by columns of 0 to `size`.
+    They are padded by columns of 0 to `size`.  Tracks are padded to `rows` meanwhile: one program for all lengths.
     """
     stacks = _stacks([probe for candidate in candidates for probe in candidate.probes])
     groups = [list(same) for _, same in itertools.groupby(stacks, lambda stack: type(stack.probes))]
     size = max(size, sum(len(stack.places) for stack in stacks))
 
     def along(track: Track) -> Columns:
-        length = track.middle.shape[1]
+        length, middle = track.middle.shape[1], track.middle
+        longer = lambda a: np.pad(a, [(0, 0), (0, max(0, rows - length)), *[(0, 0)] * (a.ndim - 2)], mode="edge")  # noqa: E731
+        padded = jax.tree.map(longer, track)
         last = track.acceleration.shape[-1], len(base.measured)
-        force, reading = (np.zeros((len(track.middle), size, length, n), track.middle.dtype) for n in last)
+        force, reading = (np.zeros((len(middle), size, length, n), middle.dtype) for n in last)
         for group in groups:  # a program for every class
-            every = each(_stack_columns, (base, [(stack.probes, stack.axes) for stack in group]), track)
+            every = each(_stack_columns, (base, [(stack.probes, stack.axes) for stack in group]), padded)
             for stack, columns in zip(group, every, strict=True):
                 for full, values in ((force, columns.force), (reading, columns.reading)):
-                    full[:, stack.places] = np.asarray(values)[:, : len(stack.places)]
+                    full[:, stack.places] = np.asarray(values)[:, : len(stack.places), :length]
         return Columns(force, reading)
 
     return along

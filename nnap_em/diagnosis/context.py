@@ -7,7 +7,6 @@ from typing import NamedTuple, TypeVar, cast
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy import stats
@@ -105,12 +104,12 @@ def smooth(context: SearchContext, hypothesis: Hypothesis, length: int) -> tuple
     A diverged sequence is most informative around its divergence: it is used up to 8, 3 or 1 rows after that moment,
     the longest stretch that the smoother still follows.
     """
-    before, rows = context.before, context.data.t.shape[1]
+    before = context.before
     smoother, every = before.smoother, horizon(context.data, length)  # uncut: the program of the fit serves
     posterior = e_step(hypothesis.model, every, smoother, key=before.state.key)
     whole = np.asarray(not_diverged(posterior, every))
     both = _cut(posterior.state, length), _cut(every, length)
-    fit = SmoothedFit(context.declared, hypothesis, *both, whole, rows, context.pieces)
+    fit = SmoothedFit(context.declared, hypothesis, *both, whole, context.longest, context.pieces)
     if whole.all():
         return fit, whole
     dof = len(hypothesis.model.system.coordinates)
@@ -119,8 +118,8 @@ def smooth(context: SearchContext, hypothesis: Hypothesis, length: int) -> tuple
     first = np.where(large.any(axis=1), large.argmax(axis=1), every.t.shape[1])
     row, used, cut = np.arange(every.t.shape[1]), whole, every
     for later in context.effort.later:
-        early = every.valid & jnp.asarray(row < first[:, None] + later)
-        cut = cut._replace(valid=jnp.where(jnp.asarray(used)[:, None], cut.valid, early))
+        early = np.asarray(every.valid) & (row < first[:, None] + later)
+        cut = cut._replace(valid=np.where(used[:, None], cut.valid, early))
         posterior = e_step(hypothesis.model, cut, smoother, key=before.state.key)
         used = np.asarray(not_diverged(posterior, cut))
         if used.all():

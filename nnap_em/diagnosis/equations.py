@@ -265,7 +265,7 @@ def _round(
     first = simulated.simulated(lean.model, lean.m_step.prior, search.data, begin)
     search = search._replace(begin=begin, scale=simulated.scale_of(first))
     present = {key_of(effect) for effect in hypothesis.model.effects}
-    log, rows = search.log, search.data.t.shape[1]
+    log, rows = search.log, int(np.asarray(search.data.valid).sum(axis=1).max())
     nothing = None, (), Step(rows, (), (), None, 0, MEASURE)
     if not (fits := search.fit(lean, [((), ())])):
         return nothing

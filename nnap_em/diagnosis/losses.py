@@ -14,11 +14,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
+from ..data.dataset import whole_step
 from ..em.multistep import (
     HORIZONS,
     JUDGED,
     SHORT_HORIZONS,
     Followed,
+    at_once,
     errors,
     finish,
     followed,
@@ -29,7 +31,7 @@ from ..em.multistep import (
 )
 from ..model.state_space import StateSpaceModel
 from ..numerics.gaussian import Gaussian
-from .columns import Blocks, columns_by_block, tracks
+from .columns import Blocks, candidate_columns, tracks
 from .hypothesis import Hypothesis
 from .refit import Refit
 from .smoothed import SmoothedFit
@@ -81,9 +83,13 @@ class MultiStep(eqx.Module):
         follows, rows = followed(model, weights.prior, path, data), starts(model, data, every)
         track = jax.tree.map(np.asarray, tracks(model, path, follows.linear.seq.inputs))
         error, own = errors(follows, every), weights.nodes.size + weights.prior.size
-        for along in columns_by_block(_machine(fit), blocks):
+        size = max(sum(len(candidate.probes) for candidate in block) for block in blocks)  # columns of 0 fill them up
+        full = whole_step(fit.rows)
+        share = at_once(model, own + size, full)
+        for block in blocks:
+            along = candidate_columns(_machine(fit), block, size, full)
             extra = lambda s: along(jax.tree.map(lambda a: a[s], track))  # noqa: B023, E731
-            predictions = open_loop(follows, weights, extra, every, error)
+            predictions = open_loop(follows, weights, extra, every, error, share=share)
             weight = weighed(predictions._replace(columns=predictions.columns[..., :own]), fit.used)
             yield tuple(
                 Linearised(

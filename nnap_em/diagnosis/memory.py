@@ -6,7 +6,7 @@ import jax
 import numpy as np
 from jaxtyping import PRNGKeyArray
 
-from ..data.dataset import Dataset
+from ..data.dataset import Dataset, stepped
 from ..data.logs import Logs, sequences_of
 from ..data.rig import Rig
 from ..em.loop import EPOCHS, SCHEDULE, Schedule
@@ -69,7 +69,7 @@ def identify(
 
 def with_memory(fitted: Identified, data: Dataset | Logs, log: Log = silent) -> Identified:
     """A fit with a static map, or one with contacts where the search accepts them; with a sentence on each joint."""
-    data = Dataset(*map(jax.device_put, sequences_of(data, fitted.rig)))
+    data = Dataset(*map(jax.device_put, stepped(sequences_of(data, fitted.rig))))
     before, joints = fitted._replace(smoother=unbranched(fitted.bank)), len(fitted.model.system.coordinates)
     effort = SEARCH_EFFORT._replace(most=joints, shortlist=joints)
     white = white_readings(data, fitted.model)

@@ -14,6 +14,7 @@ from ..effects import AbstractEffect, Candidate, SearchScales, catalogue, flat, 
 from ..em.build import measure_scales
 from ..model.state_space import StateSpaceModel, with_effects
 from ..numerics.gaussian import Gaussian
+from ..numerics.parallel import each
 from .keys import key_of
 
 
@@ -33,7 +34,7 @@ def surroundings(
     low, high = np.percentile(mean[:, :dof], [0.5, 99.5], axis=0)
     y = np.asarray(data.y)
     clock = np.asarray(data.t)[valid]
-    drive = np.nan_to_num(np.asarray(_drives(model, jnp.asarray(path.mean), data)))
+    drive = np.nan_to_num(np.asarray(each(_drives, with_effects(model, ()), (path.mean, data))))
     speed = np.percentile(np.abs(mean[:, dof : 2 * dof]), 99.5, axis=0) + 1e-9
     ends = jnp.asarray(np.outer([1.0, 0.4, -0.4, -1.0], speed))
     fast, slow, back, fast_back = np.asarray(_torques(model.unknown, ends))
@@ -62,11 +63,10 @@ def surroundings(
     )
 
 
-@eqx.filter_jit
-def _drives(model: StateSpaceModel, x: Float[Array, "seq time state"], data: Dataset) -> Float[Array, "seq time dof"]:
-    """Generalised force of the inputs along the smoothed paths [N m, or N]."""
-    plain = with_effects(model, ())
-    return jax.vmap(lambda x, seq: plain.driving((), x, plain.inputs(seq)))(x, data)
+def _drives(plain: StateSpaceModel, one) -> Float[Array, "time dof"]:
+    """Generalised force of the inputs along the smoothed path of one sequence [N m, or N]."""
+    x, seq = one
+    return plain.driving((), x, plain.inputs(seq))
 
 
 @eqx.filter_jit

@@ -75,7 +75,7 @@ def refit(
     def program(rule: ScoringMStep, core: Core, path: Gaussian):
         linear = locals_along(rule.whole(model, core), rule.prior, path, data, CUBATURE)
         posterior, read, steady = each(_smoothed, (core.log_q, core.log_r, core.start), (linear, path))
-        following, hessian, _ = rule.advance(core, linear, posterior, read, jnp.asarray(used))
+        following, hessian, _ = rule.advance(core, linear, posterior, read, used)
         return following, steady, posterior.loglik, hessian
 
     best, stride, base, goal = None, 1.0, core, core

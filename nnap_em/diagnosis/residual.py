@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from ..data.dataset import Dataset
+from ..data.dataset import Dataset, stepped
 from ..data.units import force_unit, joint_called, state_unit
 from ..em.mstep import not_diverged
 from ..fit.identify import Identified
@@ -151,10 +151,11 @@ def residual(fitted: Identified, data: Dataset) -> Residual:
     small: a slow force comes out whole, single kicks do not.  Innovations are those of the Kalman filter of the model
     linearised about the smoothed distribution by cubature, whichever smoother gave that.
     """
-    data = jax.device_put(data)
+    rows, data = data.t.shape[1], jax.device_put(stepped(data))
     posterior = posterior_of(fitted, data)
     outcome = map(np.asarray, each(_left, fitted.model, (data, posterior)))
     innovation, force, std, partial_force, partial_force_std, state, predicted, u = outcome
     t, valid = np.asarray(data.t), np.asarray(data.valid)
     used = np.asarray(not_diverged(posterior, data)) & np.isfinite(np.where(valid[..., None], state, 0.0)).all((1, 2))
-    return Residual(innovation, force, std, partial_force, partial_force_std, state, predicted, u, t, valid, used)
+    left = Residual(innovation, force, std, partial_force, partial_force_std, state, predicted, u, t, valid, used)
+    return left._replace(**{name: getattr(left, name)[:, :rows] for name in Residual._fields if name != "used"})

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, PRNGKeyArray
 from scipy import stats
 
-from ..data.dataset import Dataset
+from ..data.dataset import Dataset, stepped
 from ..data.logs import Logs, sequences_of
 from ..data.rig import Rig
 from ..effects.sensor import SensorQuantization
@@ -280,7 +280,7 @@ def diagnose(
     if start is None and rig.memory:  # the search has a law with memory of its own
         log("friction is learned as a static map; the search tries memory as the law presliding_friction")
         rig = dataclasses.replace(rig, memory=False)
-    data = Dataset(*map(jax.device_put, sequences_of(data, rig)))
+    data = Dataset(*map(jax.device_put, stepped(sequences_of(data, rig))))
     stages: Stages = {}
 
     declared = begin(rig, data, key=key).model

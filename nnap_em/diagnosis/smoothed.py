@@ -2,7 +2,6 @@
 
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -16,6 +15,7 @@ from ..fit.identify import Identified
 from ..model.state_space import StateSpaceModel
 from ..numerics.gaussian import Gaussian
 from ..numerics.ode import integrate
+from ..numerics.parallel import each
 from ..smoother.posterior import AbstractSmoother
 from .hypothesis import Hypothesis
 
@@ -67,21 +67,23 @@ def risen_since(own: SmoothedFit, now: SmoothedFit) -> Risen:
     return risen(out.level, level(errors_of(now.model, now.m_step, now.path, now.data), out.scale))
 
 
-@eqx.filter_jit
 def extended(model: StateSpaceModel, path: Gaussian, data: Dataset) -> Gaussian:
     """`path` of the model without its last effects, with the memory that these would have along it."""
-    width, states = path.mean.shape[-1], model.start.mean.shape[0]
-    still = jnp.zeros(len(model.system.coordinates), path.mean.dtype)
+    return each(_extended, model, (path, data)) if model.start.mean.shape[0] > path.mean.shape[-1] else path
 
-    def one(mean, cov, seq):
-        def step(m, slices):
-            x, u = slices
-            memory_rate = lambda m, part=0.0: model.rate(jnp.concatenate([x, m]), u.at(part), still)[width:]  # noqa: E731
-            return integrate(memory_rate, m, model.dt, model.steps, timed=model.smooth), m
 
-        _, memory = jax.lax.scan(step, model.start.mean[width:], (mean, model.inputs(seq)))
-        wide = jnp.zeros((mean.shape[0], states, states), cov.dtype)
-        wide = wide.at[:, :width, :width].set(cov).at[:, width:, width:].set(model.start.cov[width:, width:])
-        return Gaussian(jnp.concatenate([mean, memory], axis=1), wide)
+def _extended(model: StateSpaceModel, one) -> Gaussian:
+    """Path of one sequence."""
+    (mean, cov), seq = one
+    width, states = mean.shape[-1], model.start.mean.shape[0]
+    still = jnp.zeros(len(model.system.coordinates), mean.dtype)
 
-    return jax.vmap(one)(path.mean, path.cov, data) if states > width else path
+    def step(m, slices):
+        x, u = slices
+        memory_rate = lambda m, part=0.0: model.rate(jnp.concatenate([x, m]), u.at(part), still)[width:]  # noqa: E731
+        return integrate(memory_rate, m, model.dt, model.steps, timed=model.smooth), m
+
+    _, memory = jax.lax.scan(step, model.start.mean[width:], (mean, model.inputs(seq)))
+    wide = jnp.zeros((mean.shape[0], states, states), cov.dtype)
+    wide = wide.at[:, :width, :width].set(cov).at[:, width:, width:].set(model.start.cov[width:, width:])
+    return Gaussian(jnp.concatenate([mean, memory], axis=1), wide)

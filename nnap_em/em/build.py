@@ -128,7 +128,7 @@ def measure_scales(rig: Rig, system: AbstractSystem, data: Dataset) -> Scales:
             torque = torque_along(servos[i], torque, q, scale, rig.dt)
         drive[joint - 1] = abs(system.gears[i]) * np.sqrt(np.nanmean(torque[valid] ** 2))
     speed = np.maximum(speed, 1e-6)
-    least = speed / (rig.dt * float(np.max(np.sum(data.valid, axis=1))))  # to reach the largest speed in a sequence
+    least = speed / (rig.dt * float(np.max(np.sum(valid, axis=1))))  # to reach the largest speed in a sequence
     return Scales(speed, np.maximum(acceleration, least), np.maximum(gravity + drive, 1e-6 + mass * acceleration * 0.1))
 
 

@@ -12,15 +12,15 @@ from typing import NamedTuple
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from ..data.dataset import Dataset, horizon, padded
+from ..data.dataset import Dataset, horizon
 from ..model.base import AbstractModel, prepare
 from ..numerics.parallel import batches, each
 from ..numerics.profile import stage
+from ..numerics.random import keys_of
 from ..smoother.posterior import AbstractBranching, AbstractSmoother, Posterior, likeliest
 from ..storage.journal import HERE, step
 from .mstep import AbstractMStep, MStepInfo, between, not_diverged
@@ -87,23 +87,17 @@ def e_step(
     smoother: AbstractSmoother,
     *,
     key: PRNGKeyArray,
-    shape: tuple[int, ...] = (0, 0),
 ) -> Posterior:
     """Smooth every sequence of `data`, on the devices of `parallel.over`, in groups that keep below `smoother.room`.
 
-    Sequences that are too wide for it are smoothed by its second one, too, and the likelier outcome is kept. Where
-    `shape` (sequences, rows) is larger than that of `data`, its program serves, and what pads them is cut off.
+    Sequences that are too wide for it are smoothed by its second one, too, and the likelier outcome is kept.
     """
-    first = _alone(model, padded(data, shape), smoother, key=key)
-    (count, length), rows = data.t.shape, first.state.mean.shape[1]
-    if first.loglik.shape[0] > count or rows > length:
-        first = jax.tree.map(lambda a: np.asarray(a)[(slice(count), slice(length - rows or None))[: a.ndim]], first)
-    return _with_mixture(model, data, smoother.second(), first)
+    return _with_mixture(model, data, smoother.second(), _alone(model, data, smoother, key=key))
 
 
 def _alone(model: AbstractModel, data: Dataset, smoother: AbstractSmoother, *, key: PRNGKeyArray) -> Posterior:
     """`e_step` without a second smoother."""
-    keys = jax.random.split(key, data.t.shape[0])
+    keys = keys_of(key, data.t.shape[0])
     outcomes = [_apart(model, data, one, keys) for one in smoother.tries()]
     return outcomes[0] if len(outcomes) == 1 else _likeliest(outcomes)
 
@@ -146,24 +140,26 @@ def _likeliest_path(common, one) -> tuple[Posterior, Float[Array, ""]]:
     return jax.tree.map(lambda a: a[likeliest(paths.loglik)], paths), second.loglik(model, ready, first)
 
 
-@eqx.filter_jit
 def _replaced(first: Posterior, second: Posterior, loglik: Float[Array, " some"], index) -> Posterior:
     """`second` at the places `index` of `first`, where it is likelier than these are by their `loglik`."""
-    pick = lambda a, b: jnp.where(known.reshape(-1, *[1] * (b.ndim - 1)), b, a[index])  # noqa: E731
-    known = second.loglik > jnp.where(jnp.isnan(loglik), -jnp.inf, loglik)
-    second = second._replace(width=jax.tree.map(lambda a: a[index], first.width))
-    return jax.tree.map(lambda a, b: a.at[index].set(pick(a, b)), first, second)
+    known = np.flatnonzero(np.asarray(second.loglik) > np.nan_to_num(np.asarray(loglik), nan=-np.inf, neginf=-np.inf))
+    first, second = jax.tree.map(np.array, (first, second._replace(width=first.width)))
+
+    def put(a: np.ndarray, b: np.ndarray) -> jax.Array:
+        a[index[known]] = b[known]
+        return jax.device_put(a)
+
+    width = first.width
+    return jax.tree.map(put, first._replace(width=None), second._replace(width=None))._replace(width=width)
 
 
-@eqx.filter_jit
 def _likeliest(outcomes: list[Posterior]) -> Posterior:
     """The likeliest for every sequence, with the width of the first."""
-
-    def one(*tries):
-        best = likeliest(jnp.stack([posterior.loglik for posterior in tries]))
-        return jax.tree.map(lambda *leaves: jnp.stack(leaves)[best], *tries)._replace(width=tries[0].width)
-
-    return jax.vmap(one)(*outcomes)
+    score = np.stack([np.asarray(posterior.loglik) for posterior in outcomes])
+    best = np.argmax(np.where(np.isfinite(score), score, -np.inf), axis=0)
+    at = np.arange(len(best))
+    pick = lambda *leaves: jax.device_put(np.stack(leaves)[best, at])  # noqa: E731
+    return jax.tree.map(pick, *outcomes)._replace(width=outcomes[0].width)
 
 
 def _smooth(common, one) -> Posterior:

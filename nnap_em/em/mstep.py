@@ -17,13 +17,14 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from ..data.dataset import Dataset, fill_missing
+from ..data.dataset import Dataset
 from ..model.base import AbstractModel
 from ..model.state_space import StateSpaceModel
 from ..numerics.gaussian import Gaussian
-from ..numerics.parallel import each, on_default_device
+from ..numerics.parallel import each, few_sizes, on_default_device
 from ..smoother.kalman import Cubature, Tangent, kalman_filter
 from ..smoother.posterior import Posterior
 from .local import locals_along, readings_along
@@ -37,7 +38,7 @@ class MStepInfo(NamedTuple):
 
     hessian: Float[Array, "phi phi"]
     """Posterior precision of phi, at the model that was given (zero for M-steps that know none)."""
-    used: Bool[Array, " seq"]
+    used: Bool[Array | np.ndarray, " seq"]
     """Sequences that took part."""
 
 
@@ -88,16 +89,16 @@ class AbstractMStep(eqx.Module):
         """`MStepInfo.hessian` before the first epoch."""
 
 
-@eqx.filter_jit
-def not_diverged(posterior: Posterior, data: Dataset) -> Bool[Array, " seq"]:
+def not_diverged(posterior: Posterior, data: Dataset) -> Bool[np.ndarray, " seq"]:
     """Sequences that have not diverged: log-likelihood per reading not far below the median of all."""
-    _, observed = fill_missing(data.y)
-    count = jnp.sum(observed & data.valid[..., None], axis=(1, 2)).astype(posterior.loglik.dtype)
-    mean = posterior.loglik / jnp.maximum(count, 1.0)
-    finite = jnp.isfinite(mean)
-    middle = jnp.nanmedian(jnp.where(finite, mean, jnp.nan))
-    spread = 1.48 * jnp.nanmedian(jnp.where(finite, jnp.abs(mean - middle), jnp.nan))
-    return finite & (mean >= middle - jnp.maximum(0.5, 5 * spread))
+    count = np.sum(~np.isnan(np.asarray(data.y)) & np.asarray(data.valid)[..., None], axis=(1, 2))
+    mean = np.asarray(posterior.loglik) / np.maximum(count, 1)
+    finite = np.isfinite(mean)
+    if not finite.any():
+        return finite
+    middle = np.median(mean[finite])
+    spread = 1.48 * np.median(np.abs(mean[finite] - middle))
+    return finite & (np.nan_to_num(mean, neginf=-np.inf) >= middle - max(0.5, 5 * spread))
 
 
 def _quadratic(common, one) -> Quadratic:
@@ -110,14 +111,19 @@ def _loglik(common, linear: Local) -> Float[Array, ""]:
     return kalman_filter(log_q, log_r, start, linear.affine, linear.reading, linear.seq).loglik
 
 
-@eqx.filter_jit
 def _widened(prior: ParameterPrior, w, linear: Local, path: Gaussian, pad: int):
     """Parameters, and sensitivities to them, with `pad` more that do nothing, nameless here; and the first states."""
-    widen = lambda a: jnp.pad(a, [(0, 0)] * (a.ndim - 1) + [(0, pad)])  # noqa: E731
-    mean, std = widen(prior.mean), jnp.pad(prior.std, (0, pad), constant_values=1.0)
-    wide = ParameterPrior(tuple(map(str, range(mean.shape[0]))), mean, std)
+    widen = lambda a: np.pad(np.asarray(a), [(0, 0)] * (a.ndim - 1) + [(0, pad)])  # noqa: E731
+    mean, std = widen(prior.mean), np.pad(np.asarray(prior.std), (0, pad), constant_values=1.0)
+    wide = ParameterPrior(tuple(map(str, range(mean.shape[0]))), jnp.asarray(mean), jnp.asarray(std))
     moved = widen(linear.by_parameter), widen(linear.reading_by_parameter)
-    return wide, widen(w), moved, jax.tree.map(lambda a: a[:, 0], path)
+    return wide, jnp.asarray(widen(w)), moved, jax.tree.map(lambda a: np.asarray(a)[:, 0], path)
+
+
+def _lengthened(every: Any) -> Any:
+    """Arrays of all sequences, zero for more of them: one program for many numbers of sequences."""
+    size = few_sizes(len(jax.tree.leaves(every)[0]))
+    return jax.tree.map(lambda a: np.pad(np.asarray(a), [(0, size - len(a))] + [(0, 0)] * (a.ndim - 1)), every)
 
 
 @eqx.filter_jit
@@ -261,8 +267,8 @@ class ScoringMStep(AbstractMStep):
         linear: Local,
         posterior: Posterior,
         read: Float[Array, "seq time node obs"],
-        used: Bool[Array, " seq"],
-    ) -> tuple[Core, Float[Array, "phi phi"], Bool[Array, " seq"]]:
+        used: Bool[Array | np.ndarray, " seq"],
+    ) -> tuple[Core, Float[Array, "phi phi"], Bool[np.ndarray, " seq"]]:
         """The step itself: one program for models of every structure; parameters are nameless here.
 
         With it the posterior precision where it began, and which of the sequences `used` could be.
@@ -275,8 +281,9 @@ class ScoringMStep(AbstractMStep):
         linear = linear._replace(by_parameter=of_state, reading_by_parameter=of_reading)
         common = (core.log_q, core.log_r, core.start, rule.weights(core).nodes)
         terms = each(_quadratic, common, (linear, posterior, read))
-        inputs = on_default_device((rule, core._replace(w=w), terms, first, posterior.loglik, used))
-        core, hessian, used = _advance(*inputs)
+        every = _lengthened((terms, first, posterior.loglik, used))
+        core, hessian, took_part = _advance(*on_default_device((rule, core._replace(w=w), *every)))
+        used = np.asarray(took_part)[: len(used)]
         if linear.reading_by_force is not None:
             core = core._replace(log_r=_noise_floor(linear, core.log_q, core.log_r))
         return *_narrowed(core, hessian, pad), used

@@ -5,6 +5,7 @@ filter up to the start and of the open loop from there on, so that the errors ar
 """
 
 import itertools
+import warnings
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -107,7 +108,17 @@ def followed(model: StateSpaceModel, prior: ParameterPrior, path: Gaussian, data
     """`model` along the paths of all sequences."""
     linear = _wide(model, prior, path, data)
     state, gain = each(_filtered, (model.log_q, model.log_r, model.start), linear)
-    return Followed(model, data, linear, 0.5 * (path.mean + linear.ahead), state, gain)
+    middle = jax.device_put(0.5 * (np.asarray(path.mean) + np.asarray(linear.ahead)))
+    return Followed(model, data, linear, middle, state, gain)
+
+
+NUMBERS = 1 << 23
+"""Numbers of the columns of the sequences that are worked on at once: with what follows from them 300 MB."""
+
+
+def at_once(model: StateSpaceModel, columns: int, rows: int) -> int:
+    """Sequences of `rows` samples on which a device works at once."""
+    return max(1, NUMBERS // max(1, columns * rows * (len(model.system.ports) + len(model.measured))))
 
 
 def open_loop(
@@ -116,13 +127,18 @@ def open_loop(
     extra: Callable[[Int[np.ndarray, " sequence"]], Columns] | None = None,
     horizons: tuple[float, ...] = HORIZONS,
     error: Float[np.ndarray, "seq start horizon obs"] | None = None,
+    *,
+    share: int = 0,
 ) -> OpenLoop:
-    """Multi-step errors, or `error` where it is known, and their derivatives; `extra` gives columns by sequences."""
+    """Multi-step errors, or `error` where it is known, and their derivatives; `extra` gives columns by sequences, of
+    which a device works on at most `share` at once.
+    """
     (rows, obs), ports = along.data.y.shape[1:], len(along.model.system.ports)
     grid, see, out = grid_along(along.model, along.data, horizons), channels(along.model), []
-    none = lambda indices: Columns(*(jnp.zeros((indices.size, 0, rows, n)) for n in (ports, obs)))  # noqa: E731
-    for indices, part in batches(len(along.state), along.linear, along.gain, along.middle):
-        every = each(_sensitivities, (weights.nodes, grid), (*part, (extra or none)(indices)), together=1)
+    none = lambda indices: Columns(*(np.zeros((indices.size, 0, rows, n)) for n in (ports, obs)))  # noqa: E731
+    share = share or at_once(along.model, weights.nodes.size + weights.prior.size, rows)
+    for indices, part in batches(len(along.state), along.linear, along.gain, along.middle, share=share):
+        every = each(_sensitivities, (weights.nodes, grid), (*part, (extra or none)(indices)))
         out.append(np.asarray(every)[..., see, :])
     columns, overlap = np.concatenate(out)[: len(along.state)], np.asarray(grid.ages) / grid.stride
     return OpenLoop(errors(along, horizons) if error is None else error, columns, overlap)
@@ -134,7 +150,7 @@ def errors(
     """The errors alone [rad, or m], of the readings `see` or those that are compared; NaN where there is none."""
     grid, rows = grid_along(along.model, along.data, horizons), along.state.shape[1]
     ages = np.pad(grid.ages, (0, max(0, len(HORIZONS + SHORT_HORIZONS) - len(grid.ages))), mode="edge")
-    numbers = along.model, jnp.arange(grid.stride, rows, grid.stride), jnp.asarray(ages)  # one program for all horizons
+    numbers = along.model, np.arange(grid.stride, rows, grid.stride), np.asarray(ages)  # one program for all horizons
     error = np.asarray(each(_errors, numbers, (along.state, along.linear.seq)))
     return error[:, : len(grid.starts(rows)), : len(grid.ages), see or channels(along.model)]
 
@@ -147,17 +163,20 @@ def grid_along(model: StateSpaceModel, data: Dataset, horizons: tuple[float, ...
 def _wide(model: StateSpaceModel, prior: ParameterPrior, path: Gaussian, data: Dataset) -> Local:
     """The model along its paths, with slopes as wide as predictions err, through the exact transition."""
     dof, states = len(model.system.coordinates), len(model.system.states)
-    rates = jnp.where(data.valid[..., None], path.mean[..., dof:states], jnp.nan)
-    if dof:
-        rms = jnp.sqrt(jnp.nanmean(rates**2, axis=(0, 1)))
-        spread = [SLOPE_WIDTH * HORIZONS[0] * rms, SLOPE_WIDTH * rms]
-    else:
-        spread = [SLOPE_WIDTH * jnp.nanstd(rates, axis=(0, 1)) + 1e-9]
-    spread = jnp.concatenate([*spread, jnp.full(path.mean.shape[-1] - states, 1e-6)])
-    wide = Gaussian(path.mean, jnp.broadcast_to(jnp.diag(spread**2), path.cov.shape))
+    mean = np.asarray(path.mean)
+    rates = np.where(np.asarray(data.valid)[..., None], mean[..., dof:states], np.nan)
+    with warnings.catch_warnings():  # of sequences that are nowhere known
+        warnings.simplefilter("ignore", RuntimeWarning)
+        if dof:
+            rms = np.sqrt(np.nanmean(rates**2, axis=(0, 1)))
+            spread = [SLOPE_WIDTH * HORIZONS[0] * rms, SLOPE_WIDTH * rms]
+        else:
+            spread = [SLOPE_WIDTH * np.nanstd(rates, axis=(0, 1)) + 1e-9]
+    spread = np.concatenate([*spread, np.full(mean.shape[-1] - states, 1e-6)])
+    wide = Gaussian(path.mean, jax.device_put(np.broadcast_to(np.diag(spread**2), path.cov.shape)))
     linear = locals_along(model, prior, wide, data, CUBATURE)
-    offset = linear.ahead - jnp.einsum("stij,stj->sti", linear.affine.matrix, path.mean)
-    affine = linear.affine._replace(offset=offset, noise=jnp.zeros_like(linear.affine.noise))
+    offset = np.asarray(linear.ahead) - np.einsum("stij,stj->sti", linear.affine.matrix, mean)
+    affine = linear.affine._replace(offset=offset, noise=np.zeros(linear.affine.noise.shape, mean.dtype))
     return linear._replace(affine=affine)
 
 

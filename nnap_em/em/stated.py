@@ -140,20 +140,19 @@ def discrepancy_columns(
     Draws of a Gaussian process whose length is a standard deviation of each signal.
     """
     dof, states = len(model.system.ports), len(model.system.states)
-    known = jnp.asarray(data.valid & used[:, None])[..., None]
-    u = jnp.nan_to_num(jnp.asarray(data.u)[..., : len(model.system.drives)])
-    signals = jnp.concatenate([path.mean[..., :states], u], axis=-1)
-    seen = jnp.where(known, signals, jnp.nan)
-    spread = jnp.nanstd(seen, axis=(0, 1), keepdims=True)
-    unit = (signals - jnp.nanmean(seen, axis=(0, 1), keepdims=True)) / jnp.where(spread > 0, spread, 1.0)
+    known = np.asarray(data.valid) & used[:, None]
+    u = np.nan_to_num(np.asarray(data.u)[..., : len(model.system.drives)])
+    signals = np.concatenate([np.asarray(path.mean)[..., :states], u], axis=-1)
+    spread = np.nanstd(signals[known], axis=0)
+    unit = (signals - np.nanmean(signals[known], axis=0)) / np.where(spread > 0, spread, 1.0)
     turned, shifted = jax.random.split(key)
     features = 48  # random functions of the state at every joint; twice as many gave the same within a tenth
     slope = jax.random.normal(turned, (unit.shape[-1], dof * features), unit.dtype)
     phase = jax.random.uniform(shifted, (1, 1, dof * features), unit.dtype, maxval=2 * math.pi)
-    value = math.sqrt(2 / features) * jnp.cos(unit @ slope + phase)
-    acts = jnp.repeat(jnp.diag(weights.asymmetry), features, axis=0)
-    force = jnp.moveaxis(value, -1, 1)[..., None] * acts[None, :, None]
-    return Columns(force, jnp.zeros((*force.shape[:3], data.y.shape[-1]), force.dtype))
+    value = math.sqrt(2 / features) * np.cos(unit @ np.asarray(slope) + np.asarray(phase))
+    acts = np.repeat(np.diag(weights.asymmetry), features, axis=0)
+    force = np.moveaxis(value, -1, 1)[..., None] * acts[None, :, None]
+    return Columns(force, np.zeros((*force.shape[:3], data.y.shape[-1]), force.dtype))
 
 
 def size(errors: Errors, information: Float[np.ndarray, "column column"]) -> float:

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from ..data.dataset import Dataset
+from ..data.dataset import Dataset, stepped
 from ..data.logs import Logs, logs_of_arrays, sequences_of
 from ..data.rig import Declared, Rig, RigError
 from ..data.units import quantities
@@ -154,7 +154,7 @@ def identify(
 ) -> Identified:
     """Fit the declared unknowns of a rig to logs by EM, friction as a static map: `nnap_em.identify` without memory."""
     logs = logs_of_arrays(data, rig)
-    data = sequences_of(logs, rig)
+    data = stepped(sequences_of(logs, rig))
     if rig.equations and (infinite := infinite_rates(rig, build_system(rig), logs)):
         raise RigError(f"rig {rig.name!r}: {infinite}")
     if start is None:

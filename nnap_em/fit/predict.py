@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from ..data.dataset import Dataset, fill_missing
+from ..data.dataset import Dataset, stepped
 from ..data.logs import Logs, sequences_of
 from ..em.loop import SMOOTHED, e_step
 from ..em.prior import ParameterPrior
@@ -16,6 +16,7 @@ from ..model.state_space import Inputs, StateSpaceModel
 from ..numerics.digits import counted
 from ..numerics.gaussian import Gaussian, cholesky, lower
 from ..numerics.parallel import each
+from ..numerics.random import keys_of
 from ..smoother.posterior import AbstractSmoother, Posterior
 from ..systems.plant import AbstractPlant
 from .identify import Identified, phi_samples
@@ -59,9 +60,9 @@ def given_samples(data: Dataset, given: float) -> Bool[np.ndarray, "seq time"]:
     return np.asarray(data.valid) & (t <= t[:, :1] + given + 1e-6)
 
 
-def posterior_of(fitted: Identified, data: Dataset, shape: tuple[int, ...] = (0, 0)) -> Posterior:
+def posterior_of(fitted: Identified, data: Dataset) -> Posterior:
     """p(x_k | all y) of every sequence by the smoother of the fit; one that draws gives the same each time."""
-    return e_step(fitted.model, data, fitted.smoother.tolerant(), key=fitted.state.key, shape=shape)
+    return e_step(fitted.model, data, fitted.smoother.tolerant(), key=fitted.state.key)
 
 
 def show(model, state: Gaussian, seq: Dataset) -> Gaussian:
@@ -164,12 +165,14 @@ def smooth(fitted: Identified, data: Dataset | Logs) -> Gaussian:
         >>> nnap_em.smooth(fit, test).mean.shape == (*test.t.shape, 2)
         True
     """
-    data = Dataset(*map(jax.device_put, sequences_of(data, fitted.rig)))
+    data = sequences_of(data, fitted.rig)
+    rows, data = data.t.shape[1], Dataset(*map(jax.device_put, stepped(data)))
     key_model, key_force = jax.random.split(jax.random.fold_in(fitted.state.key, SMOOTHED))
     drawn = 32  # models for the dependence of a smoothed state on the model
     path, phi = posterior_of(fitted, data).state, phi_samples(fitted, drawn, key=key_model)
     model_cov = of_states(fitted.model, fitted.m_step, path, data, phi, fitted.discrepancy, key=key_force)
-    return each(_shown, fitted.model, (path._replace(cov=path.cov + model_cov), data))
+    shown = each(_shown, fitted.model, (path._replace(cov=path.cov + model_cov), data))
+    return jax.device_put(jax.tree.map(lambda a: np.asarray(a)[:, :rows], shown))
 
 
 def predict(
@@ -179,7 +182,6 @@ def predict(
     *,
     key: PRNGKeyArray,
     samples: int = 100,
-    shape: tuple[int, ...] = (0, 0),
 ) -> Prediction:
     """Predict every state from the first readings of each sequence and all its inputs.
 
@@ -193,7 +195,6 @@ def predict(
         given: time from the first row on whose readings are used [s].
         key: random key of the sample paths.
         samples: number of sample paths.
-        shape: sequences and rows of other data: where larger, the smoother compiled for these serves.
 
     Returns:
         Mean and standard deviation (sequence, row, state) of what `fitted.model.system.readable` names: coordinates,
@@ -204,16 +205,18 @@ def predict(
         True
     """
     data = sequences_of(data, fitted.rig)
+    length, data = data.t.shape[1], stepped(data)
     known = given_samples(data, given)
-    posterior = posterior_of(fitted, data._replace(valid=known), shape)
+    posterior = posterior_of(fitted, data._replace(valid=known))
     key_draw, key_roll = jax.random.split(key)
     common = drawn_paths(fitted, samples, key=key_draw)
-    sequences, rows = data.t.shape
+    sequences, rows = np.shape(data.t)
     numbers = rows * samples * (posterior.state.mean.shape[-1] + data.u.shape[-1])
     together = max(1, AbstractSmoother.room // (32 * numbers))  # noise, inputs and what draws them
-    batch = posterior.state, data, known, jax.random.split(key_roll, sequences)
+    batch = posterior.state, data, known, keys_of(key_roll, sequences)
     mean, std = each(_roll, common, batch, together=together)
-    return Prediction(mean, std, jnp.asarray(np.asarray(data.valid) & ~known))
+    every = mean, std, np.asarray(data.valid) & ~known
+    return Prediction(*jax.device_put(tuple(np.asarray(a)[:, :length] for a in every)))
 
 
 def horizon_errors(
@@ -236,7 +239,8 @@ def horizon_errors(
         >>> list(nnap_em.horizon_errors(prediction, fit, test, 0.5, horizons=(0.1, 0.25)))
         ['x']
     """
-    y, observed = (np.asarray(a) for a in fill_missing(jnp.asarray(data.y)))
+    y = np.asarray(data.y)
+    observed = ~np.isnan(y)
     since = np.asarray(data.t) - np.asarray(data.t)[:, :1] - given
     system = fitted.model.system
     out = {}

@@ -4,7 +4,14 @@ import math
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, PRNGKeyArray, UInt
+from jaxtyping import Array, Float, Int, Key, PRNGKeyArray, UInt
+
+from .parallel import few_sizes
+
+
+def keys_of(key: PRNGKeyArray, count: int) -> Key[Array, " key"]:
+    """`count` keys and perhaps more, in one of few shapes; the first are the same for every count."""
+    return jax.random.split(key, few_sizes(count))
 
 
 def threefry(key: UInt[Array, "2"], a: UInt[Array, "*counter"], b: UInt[Array, ""]) -> tuple[Array, Array]:

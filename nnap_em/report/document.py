@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from .. import __version__
+from ..data.dataset import stepped
 from ..data.logs import Logs
 from ..data.servo import TORQUE
 from ..diagnosis.hypothesis import covariances
@@ -104,9 +105,10 @@ def predictions(sides: Mapping[str, Identified], train: Logs, test: Logs, seed: 
 
     They are smoothed by the program that smoothed `train`, unless that has more than eight times their rows.
     """
-    key, shape, size = jax.random.key(seed), train.data.t.shape, test.data.t.shape
-    shape = shape if min(np.subtract(shape, size)) >= 0 and np.prod(shape) <= 8 * np.prod(size) else size
-    return {n: predict(fitted, test.data, given_of(fitted), key=key, shape=shape) for n, fitted in sides.items()}
+    key, rows, longer = jax.random.key(seed), test.data.t.shape[1], train.data.t.shape[1]
+    data = stepped(test.data, longer if longer <= 8 * rows else 0)
+    every = {name: predict(fitted, data, given_of(fitted), key=key) for name, fitted in sides.items()}
+    return jax.device_put(jax.tree.map(lambda a: np.asarray(a)[:, :rows], every))
 
 
 def errors(predicted: Mapping[str, Prediction], sides: Mapping[str, Identified], test: Logs) -> dict[str, Any]:

@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from ..data.dataset import Dataset, horizon
 from ..model.base import AbstractModel, prepare
-from ..numerics.parallel import batches, each
+from ..numerics.parallel import each
 from ..numerics.profile import stage
 from ..numerics.random import keys_of
 from ..smoother.posterior import AbstractBranching, AbstractSmoother, Posterior, likeliest
@@ -113,10 +113,8 @@ def _with_mixture(model: AbstractModel, data: Dataset, second: AbstractBranching
     some = beyond(first, second)
     if second is None or not some.size:
         return first
-    for few, batch in batches(len(some), *jax.tree.map(lambda a: np.asarray(a)[some], (data, first.state))):
-        path, loglik = each(_likeliest_path, (model, second), batch)
-        first = _replaced(first, path, loglik, some[few])
-    return first
+    wide = jax.tree.map(lambda a: np.asarray(a)[some], (data, first.state))
+    return _replaced(first, *each(_likeliest_path, (model, second), wide, together=1), some)
 
 
 def beyond(first: Posterior, second: AbstractBranching | None) -> Int[np.ndarray, " some"]:

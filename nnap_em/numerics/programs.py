@@ -1,7 +1,4 @@
-"""How programs are compiled, and when those no longer needed are released.
-
-They hold memory maps, of which a process may have 65,530.
-"""
+"""Flags of the compiler, and the release of programs: they hold memory maps, of which a process may have 65,530."""
 
 import os
 from pathlib import Path
@@ -15,8 +12,8 @@ EMITTERS = "xla_cpu_use_fusion_emitters"
 def compile_in_half_the_time() -> None:
     """Let XLA compile for the processor with its older emitters; commands and examples do, before the first program.
 
-    The smoother of two joints is compiled in 3.3 s instead of 7.5 and runs as fast.  A jaxlib that knows the flag no
-    longer, as 0.11.1, ends the process over it; a user's own value stays.
+    The smoother of two joints is compiled in 3.3 s instead of 7.5 and runs as fast.  The next
+    jaxlib, without the flag, would end the process over it; a user's own value stays.
     """
     flags = os.environ.get("XLA_FLAGS", "")
     if EMITTERS not in flags and tuple(map(int, version.__version__.split(".")[:2])) < (0, 11):

@@ -1,91 +1,121 @@
-"""How long the first and a later run of a command take, and what they compile: the time of the one who waits for it.
+"""What an answer costs: seconds of a processor, programs and memory, at first, later, and with other recordings.
 
-    python benchmarks/answers.py --table docs/results/answers.md [FOLDER ...]     # half an hour on two idle cores
+    JAX_NUM_CPU_DEVICES=1 taskset -c 0 python benchmarks/answers.py --table docs/results/answers.md [JOB ...]
 
-Simulated rigs, and the data sets in the folders.  Each command runs twice in a process of its own: with no program at
-hand (an empty cache), then with those of the first run.
+An hour on one core of an idle machine.  Each command runs in a process of its own: with no program at hand, with those
+of the first run, and without the last two recordings, which no other program may need.
 """
 
 import argparse
 import os
 import platform
-import re
+import shutil
 import subprocess
 import sys
 import tempfile
-import time
 from datetime import date
 from pathlib import Path
 from typing import NamedTuple
 
 import diagnose
+from planted_make import ROOT
 
+sys.path.append(str(ROOT / "examples"))
+import tanks
+
+from nnap_em.commands.common import MISFIT_STATUS
 from nnap_em.storage.files import cores, replace_text
 
-CASES = ("clean:middle:hidden:101", "strong:torsional_spring:hidden:11", "outside:bump:hidden:11")
-NNAP_EM = str(Path(sys.executable).with_name("nnap-em"))
-ROWS = 14
-"""Programs in the table of one."""
+NNAP_EM = [sys.executable, "-m", "nnap_em.commands.cli"]
+DATA = ROOT.parent / "shared" / "data"
+
+
+def _paper(folder: Path) -> None:
+    subprocess.run([*NNAP_EM, "simulate", str(folder)], check=True)
+
+
+def _slide(folder: Path) -> None:
+    diagnose.plant.write(diagnose.plant.Case(system="slide", sequences=8, steps=250, noise=(5e-4, 5e-3)), folder)
+
+
+def _tanks(folder: Path) -> None:
+    tanks.write(tanks.recordings(DATA / "ode" / "cascaded_tanks"), folder)
+
+
+def _stored(name: str):
+    return lambda folder: shutil.copytree(DATA / name, folder, copy_function=shutil.copyfile)
+
+
+JOBS = {
+    "paper": ("identify", _paper),
+    "rig_b": ("diagnose", _stored("undeclared/rig_b")),
+    "slide": ("diagnose", _slide),
+    "dfki_c1": ("diagnose", _stored("measured/dfki_c1")),
+    "kr300": ("diagnose", _stored("measured/kr300")),
+    "tanks": ("diagnose", _tanks),
+}
+"""Command, and what writes its data set."""
 
 
 class Run(NamedTuple):
     """One process."""
 
     seconds: float
+    """Of a processor."""
     programs: int
-    compiling: float
-    """Tracing, lowering, and compiling or loading [s]."""
-    profile: list[str]
-    """The programs that took longest, as `--profile` prints them."""
+    """New in the cache."""
+    memory: float
+    """[GB]"""
     answer: str
 
 
 def run(command: str, folder: Path, out: Path, cache: Path) -> Run:
     """A command on a data set, in a process of its own."""
-    nnap_em = [NNAP_EM, command, str(folder), "--out", str(out), "--profile"]
-    began = time.perf_counter()
-    done = subprocess.run(nnap_em, env=os.environ | {"XDG_CACHE_HOME": str(cache)}, capture_output=True, text=True)
-    seconds = time.perf_counter() - began
-    if done.returncode:
-        raise RuntimeError(f"{' '.join(nnap_em)} ended with status {done.returncode}:\n{done.stderr}")
-    lines = (done.stdout + done.stderr).splitlines()
-    first = next(i for i, line in enumerate(lines) if re.match(r"program +count", line))
-    whole = next(line for line in lines if line.startswith("all of "))
-    count, *stages = map(float, whole.split("names")[1].split())
+    before = len([*cache.rglob("*-cache")])
+    with out.with_suffix(".log").open("w+") as said:
+        words = [*NNAP_EM, command, str(folder), "--out", str(out)]
+        environment = os.environ | {"XDG_CACHE_HOME": str(cache), "PYTHONPATH": str(ROOT)}
+        process = subprocess.Popen(words, env=environment, stdout=said, stderr=said)
+        _, status, used = os.wait4(process.pid, 0)
+        said.seek(0)
+        lines = said.read().splitlines()
+    if os.waitstatus_to_exitcode(status) not in (0, MISFIT_STATUS):
+        raise RuntimeError("\n".join([" ".join(words), *lines]))
     answer = [line.removeprefix("nnap-em: ") for line in lines if line.startswith("nnap-em: ")][-2]
-    return Run(seconds, int(count), sum(stages), lines[first : first + ROWS + 1], answer)
+    new = len([*cache.rglob("*-cache")]) - before
+    return Run(used.ru_utime + used.ru_stime, new, used.ru_maxrss / 1e6, answer)
 
 
 def main() -> None:
-    """Every job twice, and the tables."""
+    """Every job three times, and the table."""
     arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    arguments.add_argument("folders", nargs="*", type=Path, help="data sets to be diagnosed beside the simulated ones")
+    arguments.add_argument("jobs", nargs="*", metavar="JOB", help=f"of {', '.join(JOBS)}; all, if none is given")
     arguments.add_argument("--table", type=Path, required=True)
     args = arguments.parse_args()
     lines = [
         "# Time to an answer\n",
-        "The first run finds no cached program, and most of its time is compiling; the later run finds those of the "
-        "first. Times are of whole processes. `--profile` prints the programs that compile.\n",
+        "Seconds of a processor. The first run finds no cached program, a later one those of the first; others are "
+        "recordings of the same machine, two fewer.\n",
         f"{date.today()}, {platform.machine()}, {cores()} cores, Python {platform.python_version()}; "
         "written by `benchmarks/answers.py`.\n",
-        "| command | data set | first run [s] | of it compiling [s] | programs | later run [s] | answer |",
+        "| job | first [s] | programs | memory [GB] | later [s] | others: [s], programs | answer |",
         "| --- | --- | --- | --- | --- | --- | --- |",
     ]
-    with tempfile.TemporaryDirectory() as place:
-        work = Path(place)
-        jobs = [("identify", "the paper's data set", work / "paper")]
-        subprocess.run([NNAP_EM, "simulate", str(work / "paper")], check=True)
-        for name in CASES:
-            folder = work / name.replace(":", "_")
-            diagnose.plant.write(diagnose.case_of(name), folder)
-            jobs.append(("diagnose", " ".join(name.split(":")[:3]), folder))
-        jobs += [("diagnose", folder.name, folder) for folder in args.folders]
-        for number, (command, name, folder) in enumerate(jobs):
-            print(command, name, flush=True)
-            first, later = (run(command, folder, work / f"{number}_{i}", work / f"cache_{number}") for i in range(2))
-            row = f"{first.seconds:.0f} | {first.compiling:.0f} | {first.programs} | {later.seconds:.0f}"
-            lines.append(f"| {command} | {name} | {row} | {later.answer} |")
-            print(f"what the first {command} of {name} compiles", *first.profile, sep="\n", flush=True)
+    for name in args.jobs or JOBS:
+        command, make = JOBS[name]
+        with tempfile.TemporaryDirectory() as place:
+            folder, cache = Path(place, "logs"), Path(place, "cache")
+            make(folder)
+            first, later = (run(command, folder, Path(place, str(i)), cache) for i in range(2))
+            logs, others = sorted(folder.glob("train/*.csv")), "-"
+            if len(logs) > 3:
+                for log in logs[-2:]:
+                    log.unlink()
+                third = run(command, folder, Path(place, "2"), cache)
+                others = f"{third.seconds:.0f}, {third.programs}"
+        row = f"{first.seconds:.0f} | {first.programs} | {max(first.memory, later.memory):.1f} | {later.seconds:.0f}"
+        lines.append(f"| {command}, {name} | {row} | {others} | {later.answer} |")
+        print(lines[-1], flush=True)
     replace_text(args.table, "\n".join(lines) + "\n")
 
 

@@ -66,8 +66,6 @@ class Joint(NamedTuple):
     """Dry friction of the file [N m or N]."""
     range: tuple[float, float] | None
     """Positions of its stops."""
-    reduction: float = 1.0
-    """Turns of its motor for one of its own, of which the armature has the rotor's part [1, or rad/m]."""
 
 
 class Motor(NamedTuple):

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..data.dataset import whole_step
 from ..effects import AbstractEffect, Candidate, OperatingPoint
 from ..em.multistep import Columns
 from ..model import hooks
@@ -123,8 +124,9 @@ def _stack(places: list[int], probes: Sequence[AbstractEffect]) -> Stack:
     constants = [bool((a == a[0]).all()) for a in stacked]
     if all(constants):  # one probe, or one given twice
         constants = [False] * len(constants)
-    bunch = 4  # stacks are filled up to a multiple of this, so that one more probe is no other program
-    pad = lambda a: np.pad(a, [(0, -len(a) % bunch)] + [(0, 0)] * (a.ndim - 1), mode="edge")  # noqa: E731
+    bunch = 4  # stacks are filled up to a multiple of this and to a whole step, so that one more probe is no program
+    more = -(-whole_step(len(probes)) // bunch) * bunch - len(probes)
+    pad = lambda a: np.pad(a, [(0, more)] + [(0, 0)] * (a.ndim - 1), mode="edge")  # noqa: E731
     leaves = [np.asarray(a[0]) if constant else pad(a) for a, constant in zip(stacked, constants, strict=True)]
     axes = [None if constant else 0 for constant in constants]
     return Stack(places, jax.tree.unflatten(structure, leaves), jax.tree.unflatten(structure, axes))

@@ -83,7 +83,7 @@ class MultiStep(eqx.Module):
         follows, rows = followed(model, weights.prior, path, data), starts(model, data, every)
         track = jax.tree.map(np.asarray, tracks(model, path, follows.linear.seq.inputs))
         error, own = errors(follows, every), weights.nodes.size + weights.prior.size
-        size = max(sum(len(candidate.probes) for candidate in block) for block in blocks)  # columns of 0 fill them up
+        size = whole_step(max(sum(len(one.probes) for one in block) for block in blocks))  # columns of 0 fill them up
         full = whole_step(fit.rows)
         share = at_once(model, own + size, full)
         for block in blocks:

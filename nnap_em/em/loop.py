@@ -114,7 +114,8 @@ def _with_mixture(model: AbstractModel, data: Dataset, second: AbstractBranching
     if second is None or not some.size:
         return first
     wide = jax.tree.map(lambda a: np.asarray(a)[some], (data, first.state))
-    return _replaced(first, *each(_likeliest_path, (model, second), wide, together=1), some)
+    path, loglik = each(_likeliest_path, (model, second), wide, together=1)
+    return _replaced(first, path, loglik, some)
 
 
 def beyond(first: Posterior, second: AbstractBranching | None) -> Int[np.ndarray, " some"]:

@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float, Int
 from ..data.dataset import Dataset
 from ..model.state_space import StateSpaceModel
 from ..numerics.gaussian import Gaussian
-from ..numerics.parallel import batches, each
+from ..numerics.parallel import each
 from ..smoother.kalman import CUBATURE, kalman_filter
 from .local import locals_along
 from .mstep import ScoringMStep
@@ -137,10 +137,13 @@ def open_loop(
     grid, see, out = grid_along(along.model, along.data, horizons), channels(along.model), []
     none = lambda indices: Columns(*(np.zeros((indices.size, 0, rows, n)) for n in (ports, obs)))  # noqa: E731
     share = share or at_once(along.model, weights.nodes.size + weights.prior.size, rows)
-    for indices, part in batches(len(along.state), along.linear, along.gain, along.middle, share=share):
-        every = each(_sensitivities, (weights.nodes, grid), (*part, (extra or none)(indices)))
-        out.append(np.asarray(every)[..., see, :])
-    columns, overlap = np.concatenate(out)[: len(along.state)], np.asarray(grid.ages) / grid.stride
+    count, devices = len(along.state), jax.device_count()
+    every, size = jax.tree.map(np.asarray, (along.linear, along.gain, along.middle)), min(share * devices, count)
+    for first in range(0, count, size):  # the results of all, with many columns, would not fit the memory
+        some = np.minimum(np.arange(first, first + size), count - 1)
+        part = jax.tree.map(lambda a: a[some], every)  # noqa: B023
+        out.append(np.asarray(each(_sensitivities, (weights.nodes, grid), (*part, (extra or none)(some))))[..., see, :])
+    columns, overlap = np.concatenate(out)[:count], np.asarray(grid.ages) / grid.stride
     return OpenLoop(errors(along, horizons) if error is None else error, columns, overlap)
 
 

@@ -156,10 +156,7 @@ def _model(machine: Machine, file: str, held: Mapping[str, float]) -> Iterator[s
             yield f"# {key} = {{ std = {0.1 * body.mass:.2g} }}    # kg; {body.mass:.4g} in the file"
     for joint in machine.joints:
         unit = "kg" if joint.slide else "kg m^2"
-        geared = "geared" if joint.reduction == 1 else f"times {joint.reduction:g}^2"
-        size = (
-            f"{joint.armature:.4g} in the file" if joint.armature else f"0 in the file: inertia of the rotor, {geared}"
-        )
+        size = f"{joint.armature:.4g} in the file" if joint.armature else "0 in the file: inertia of the rotor, geared"
         key = dotted_key(f"{joint.name}.armature")
         yield f"# {key} = {{ std = {joint.armature or 0.01:.2g} }}    # {unit}; {size}"
 

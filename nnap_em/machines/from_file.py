@@ -1,7 +1,7 @@
 """Declaration in rig.toml of a machine from a file: names, inputs, and uncertain numbers."""
 
 import warnings
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -33,7 +33,7 @@ def declare(root: Any) -> Declaration:
         sensors=tuple(_sensors(machine, root)),
         part=None if part.whole else (part.joints, tuple(part.locked.items())),
     )
-    _warn_of_left_out(root, machine, {name for name, _ in flat(model.table("uncertain", absent={}).items)})
+    _warn_of_left_out(root, machine)
     columns, joints, motored = _inputs(machine, root)
     motors = {motor.name: motor for motor in machine.motors} if motored else {}
     file_drives = {name: Drive(one.kind, {k: Declared(x, 0.0) for k, x in one.numbers}) for name, one in motors.items()}
@@ -66,17 +66,12 @@ def _part(model: Any) -> Part:
     return Part(joints, {name: locked.number(name) for name in locked.items})
 
 
-def _warn_of_left_out(root: Any, machine: Machine, uncertain: Collection[str]) -> None:
-    """Friction of the file has no part where it is learned, and a reduction none without the inertia of a rotor."""
+def _warn_of_left_out(root: Any, machine: Machine) -> None:
+    """Friction of the file has no part where it is learned."""
     names = [joint.name for joint in machine.joints if joint.damping or joint.dry]
     if names and not machine.rubs:
         problem = f"damping and frictionloss of {', '.join(names)} are left out, as friction is learned"
         warnings.warn(f'{root.path}: {machine.file}: {problem}; friction = "none" takes the file\'s', RigWarning, 2)
-    for name, n in ((joint.name, joint.reduction) for joint in machine.joints if not joint.armature):
-        if n != 1 and f"{name}.armature" not in uncertain:
-            problem = f"the reduction of joint {name!r}, {n:g}, is left out: torques are those at the joint"
-            hint = f"a rotor counts {n:g}^2 times there: write <motorInertia>, or {name}.armature in [model.uncertain]"
-            warnings.warn(f"{root.path}: {machine.file}: {problem}; {hint}", RigWarning, 2)
 
 
 def _states(machine: Machine, root: Any) -> tuple[str, ...]:

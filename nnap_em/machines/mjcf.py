@@ -2,7 +2,7 @@
 
 import re
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,7 +14,7 @@ from ..data.servo import TORQUE
 from .locked import NOTHING, Follows, Part, hold, holding, matrix, vector
 from .source import parse, refuse
 from .spec import compiled, mujoco, opened, written
-from .urdf import Gear, refuse_urdf, transmissions
+from .urdf import refuse_urdf, warn_of_rotors
 
 _WHOLE = Part()
 
@@ -39,23 +39,23 @@ def read_file(path: Path, part: Part = _WHOLE) -> MachineFile:
     """`read_machine` with the file itself."""
     root = parse(path)
     urdf = root.tag == "robot"
-    gears = transmissions(path, root) if urdf else {}
     if urdf:
         refuse_urdf(path, root, part)
+        warn_of_rotors(path, root)
     spec = opened(path, urdf)
     model = compiled(path, spec) if part.whole else _part(path, spec, part)
     _refuse_all(path, model, _WHOLE)
-    machine = _machine(path, model, gears)
+    machine = _machine(path, model)
     _refuse_names(path, machine)
     return MachineFile(machine, written(spec))
 
 
-def _machine(path: Path, model: Any, gears: Mapping[str, Gear]) -> Machine:
+def _machine(path: Path, model: Any) -> Machine:
     return Machine(
         file=path.name,
         gravity=vector(model.opt.gravity * (model.opt.disableflags & int(mujoco().mjtDisableBit.mjDSBL_GRAVITY) == 0)),
         bodies=_bodies(model),
-        joints=tuple(_joint(model, j, gears) for j in range(model.njnt)),
+        joints=tuple(_joint(model, j) for j in range(model.njnt)),
         motors=tuple(_motors(model)),
         joint_sensors=tuple(
             JointSensor(model.sensor(i).name, int(model.sensor_objid[i]), kind == "jointvel")
@@ -280,9 +280,8 @@ def _inertia(model: Any, i: int) -> Rotation:
     return matrix(0.5 * (whole + whole.T))
 
 
-def _joint(model: Any, j: int, gears: Mapping[str, Gear]) -> Joint:
+def _joint(model: Any, j: int) -> Joint:
     dof, place = int(model.jnt_dofadr[j]), int(model.jnt_qposadr[j])
-    gear = gears.get(model.joint(j).name, Gear())
     return Joint(
         name=model.joint(j).name,
         body=int(model.jnt_bodyid[j]) - 1,
@@ -292,11 +291,10 @@ def _joint(model: Any, j: int, gears: Mapping[str, Gear]) -> Joint:
         zero=float(model.qpos0[place]),
         stiffness=float(np.ravel(model.jnt_stiffness[j])[0]),
         rest=float(model.qpos_spring[place]),
-        armature=float(model.dof_armature[dof]) + gear.inertia,
+        armature=float(model.dof_armature[dof]),
         damping=float(np.ravel(model.dof_damping[dof])[0]),
         dry=float(model.dof_frictionloss[dof]),
         range=(float(model.jnt_range[j][0]), float(model.jnt_range[j][1])) if model.jnt_limited[j] else None,
-        reduction=gear.reduction,
     )
 
 

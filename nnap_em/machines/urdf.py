@@ -1,66 +1,21 @@
-"""Parts of URDF that MuJoCo's compiler refuses unclearly, misreads or leaves out: rings, mimics, transmissions."""
+"""Parts of URDF that MuJoCo's compiler refuses unclearly, misreads or leaves out: rings, mimics, rotors."""
 
-import math
 import warnings
-from collections.abc import Collection, Iterator
+from collections.abc import Collection
 from pathlib import Path
-from typing import NamedTuple
 from xml.etree import ElementTree as ET
 
 from ..data.rig import RigWarning
 from .locked import Part, holding
 from .source import place, refuse
 
-_REDUCTION, _INERTIA = ("mechanicalreduction", "gearratio"), ("motorinertia", "rotorinertia")
-"""Names of the numbers of a `<transmission>` in ros_control, ros2_control and Drake, in small letters without _."""
 
-
-class Gear(NamedTuple):
-    """A motor behind a gear, as the joint has it."""
-
-    reduction: float = 1.0
-    """Turns of the motor for one of the joint [1, or rad/m]."""
-    inertia: float = 0.0
-    """Inertia of the rotor at the joint: reduction^2 times its own [kg m^2, or kg]."""
-
-
-def transmissions(path: Path, root: ET.Element) -> dict[str, Gear]:
-    """Gears of a URDF file by joint; warns of a `<transmission>` that is not one gear of one joint.
-
-    A file that has the same transmission in two dialects has one motor.
-    """
-    gears: dict[str, Gear] = {}
+def warn_of_rotors(path: Path, root: ET.Element) -> None:
+    """Warn of a `<transmission>` with the inertia of a rotor, which is not read."""
     for element in root.iter("transmission"):
-        ratios = {ratio for ratio in _numbers(path, element, _REDUCTION) if ratio != 1}
-        inertias = list(_numbers(path, element, _INERTIA))
-        joints = {str(joint.get("name")) for joint in element.findall("joint")}
-        if not ratios and not any(inertias):
-            continue
-        if len(joints) != 1 or len(ratios) > 1 or not joints <= {joint.get("name") for joint in root.findall("joint")}:
-            problem = (
-                f"<transmission> {element.get('name')!r} is left out, as it is not one gear of one joint of the file"
-            )
-            hint = "its rotor is [model.uncertain] JOINT.armature: reduction^2 times its inertia"
-            warnings.warn(f"{path}: {place(element)}: {problem}; {hint}", RigWarning, 2)
-            continue
-        (joint,), ratio = joints, abs(next(iter(ratios), 1.0))
-        gear = Gear(ratio, ratio**2 * sum(inertias))
-        gears[joint] = max(gear, gears.get(joint, gear), key=lambda one: one.inertia)
-    return gears
-
-
-def _numbers(path: Path, transmission: ET.Element, names: tuple[str, ...]) -> Iterator[float]:
-    """Numbers of these names anywhere in a `<transmission>`, as text or as an attribute `value`."""
-    for element in transmission.iter():
-        if element.tag.rpartition(":")[2].replace("_", "").lower() in names:
-            written = element.get("value", element.text or "").strip()
-            try:
-                number = float(written)
-            except ValueError:
-                number = math.nan
-            if not math.isfinite(number) or (names is _INERTIA and number < 0) or (names is _REDUCTION and not number):
-                refuse(path, f"<{element.tag}> is {written!r}", "write a number in SI units, or take it out", element)
-            yield number
+        if any("inertia" in part.tag.lower() for part in element.iter()):
+            hint = "write its inertia times the reduction squared as JOINT.armature in [model.uncertain]"
+            warnings.warn(f"{path}: {place(element)}: the rotor of a <transmission> is not read; {hint}", RigWarning, 2)
 
 
 def stuck(root: ET.Element, logged: Collection[str]) -> dict[str, float]:

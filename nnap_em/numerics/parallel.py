@@ -110,17 +110,6 @@ def each(function: Callable, common: Any, batch: Any, *, together: int | None = 
     return jax.tree.map(lambda *a: jnp.concatenate(a)[:count], *parts)
 
 
-def batches(count: int, *trees: Any, share: int = 1) -> Iterator[tuple[Int[np.ndarray, " entry"], tuple[Any, ...]]]:
-    """Batches of at most `share` entries a device: indices, and the entries of `trees`; the last is repeated at the
-    end. They serve work whose results, of all entries together, would not fit the memory.
-    """
-    every = jax.tree.map(np.asarray, trees)  # NumPy cuts by views, JAX by a program for every shape
-    size = jax.device_count() * min(share, -(-count // jax.device_count()))
-    for first in range(0, count, size):
-        indices = np.minimum(np.arange(first, first + size), count - 1)
-        yield indices, jax.tree.map(lambda a, indices=indices: a[indices], every)
-
-
 @functools.cache
 def _program(function: Callable) -> Callable:
     """A program under the name of what it does."""

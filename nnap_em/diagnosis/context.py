@@ -93,9 +93,10 @@ class SearchContext(NamedTuple):
         return Hypothesis(self.before.model, self.before.m_step, (None,) * len(self.before.model.effects))
 
 
-def _cut(tree: _Tree, length: int) -> _Tree:
-    """All of it, over no more rows than a short horizon needs."""
-    return jax.tree.map(lambda a: np.asarray(a)[:, :SHORT], tree) if length <= SHORT else tree  # a view, no program
+def _cut(tree: _Tree, length: int, longest: int) -> _Tree:
+    """All of it, over no more rows than a horizon needs that is short, and not whole sequences."""
+    short = length <= SHORT and length < longest
+    return jax.tree.map(lambda a: np.asarray(a)[:, :SHORT], tree) if short else tree  # a view, no program
 
 
 def smooth(context: SearchContext, hypothesis: Hypothesis, length: int) -> tuple[SmoothedFit, Bool[np.ndarray, " seq"]]:
@@ -108,7 +109,7 @@ def smooth(context: SearchContext, hypothesis: Hypothesis, length: int) -> tuple
     smoother, every = before.smoother, horizon(context.data, length)  # uncut: the program of the fit serves
     posterior = e_step(hypothesis.model, every, smoother, key=before.state.key)
     whole = np.asarray(not_diverged(posterior, every))
-    both = _cut(posterior.state, length), _cut(every, length)
+    both = _cut((posterior.state, every), length, context.longest)
     fit = SmoothedFit(context.declared, hypothesis, *both, whole, context.longest, context.pieces)
     if whole.all():
         return fit, whole
@@ -124,7 +125,8 @@ def smooth(context: SearchContext, hypothesis: Hypothesis, length: int) -> tuple
         used = np.asarray(not_diverged(posterior, cut))
         if used.all():
             break
-    return fit._replace(path=_cut(posterior.state, length), data=_cut(cut, length), used=used), whole
+    path, cut = _cut((posterior.state, cut), length, context.longest)
+    return fit._replace(path=path, data=cut, used=used), whole
 
 
 def extend(context: SearchContext, hypothesis: Hypothesis, first: int) -> EMState:

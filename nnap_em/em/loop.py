@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
@@ -99,7 +100,7 @@ def _alone(model: AbstractModel, data: Dataset, smoother: AbstractSmoother, *, k
     """`e_step` without a second smoother."""
     keys = keys_of(key, data.t.shape[0])
     outcomes = [_apart(model, data, one, keys) for one in smoother.tries()]
-    return outcomes[0] if len(outcomes) == 1 else _likeliest(outcomes)
+    return outcomes[0] if len(outcomes) == 1 else each(_likeliest, None, outcomes)
 
 
 def _apart(model: AbstractModel, data: Dataset, smoother: AbstractSmoother, keys) -> Posterior:
@@ -152,13 +153,10 @@ def _replaced(first: Posterior, second: Posterior, loglik: Float[Array, " some"]
     return jax.tree.map(put, first._replace(width=None), second._replace(width=None))._replace(width=width)
 
 
-def _likeliest(outcomes: list[Posterior]) -> Posterior:
-    """The likeliest for every sequence, with the width of the first."""
-    score = np.stack([np.asarray(posterior.loglik) for posterior in outcomes])
-    best = np.argmax(np.where(np.isfinite(score), score, -np.inf), axis=0)
-    at = np.arange(len(best))
-    pick = lambda *leaves: jax.device_put(np.stack(leaves)[best, at])  # noqa: E731
-    return jax.tree.map(pick, *outcomes)._replace(width=outcomes[0].width)
+def _likeliest(_, tries: list[Posterior]) -> Posterior:
+    """The likeliest of one sequence, with the width of the first."""
+    best = likeliest(jnp.stack([posterior.loglik for posterior in tries]))
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves)[best], *tries)._replace(width=tries[0].width)
 
 
 def _smooth(common, one) -> Posterior:

@@ -18,6 +18,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Bool, Float
 
 from ..data.dataset import Dataset
@@ -89,16 +90,21 @@ class AbstractMStep(eqx.Module):
         """`MStepInfo.hessian` before the first epoch."""
 
 
-def not_diverged(posterior: Posterior, data: Dataset) -> Bool[np.ndarray, " seq"]:
-    """Sequences that have not diverged: log-likelihood per reading not far below the median of all."""
-    count = np.sum(~np.isnan(np.asarray(data.y)) & np.asarray(data.valid)[..., None], axis=(1, 2))
-    mean = np.asarray(posterior.loglik) / np.maximum(count, 1)
-    finite = np.isfinite(mean)
-    if not finite.any():
+def not_diverged(posterior: Posterior, data: Dataset) -> Bool[Array | np.ndarray, " seq"]:
+    """Sequences that have not diverged: log-likelihood per reading not far below the median of all.
+
+    By NumPy where it is no part of a larger program: no program for every number of sequences.
+    """
+    loglik, y, valid = posterior.loglik, data.y, data.valid
+    xp: Any = jnp if any(isinstance(a, Tracer) for a in (loglik, y, valid)) else np
+    loglik, y, valid = map(xp.asarray, (loglik, y, valid))
+    mean = loglik / xp.maximum(xp.sum(~xp.isnan(y) & valid[..., None], axis=(1, 2)).astype(loglik.dtype), 1.0)
+    finite = xp.isfinite(mean)
+    if xp is np and not finite.any():
         return finite
-    middle = np.median(mean[finite])
-    spread = 1.48 * np.median(np.abs(mean[finite] - middle))
-    return finite & (np.nan_to_num(mean, neginf=-np.inf) >= middle - max(0.5, 5 * spread))
+    middle = xp.nanmedian(xp.where(finite, mean, xp.nan))
+    spread = 1.48 * xp.nanmedian(xp.where(finite, xp.abs(mean - middle), xp.nan))
+    return finite & (xp.where(finite, mean, 0.0) >= middle - xp.maximum(0.5, 5 * spread))
 
 
 def _quadratic(common, one) -> Quadratic:

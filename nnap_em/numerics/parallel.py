@@ -81,10 +81,10 @@ def each(function: Callable, common: Any, batch: Any, *, together: int | None = 
     Compiled, and cached by `function`, which therefore stands at the top of its module.  At most `together` entries
     are worked on at once by each device; without it, on an accelerator, all are.
     """
-    if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((common, batch))):  # part of a larger program
-        return jax.vmap(lambda one: function(common, one))(batch)
-    mesh = _mesh.get()
     count = next(leaf for leaf in jax.tree.leaves(batch) if eqx.is_array_like(leaf)).shape[0]
+    if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((common, batch))):  # part of a larger program
+        return jax.vmap(lambda one: function(common, one))(jax.tree.map(lambda a: a[:count], batch))
+    mesh = _mesh.get()
     share = -(-count // (1 if mesh is None else mesh.size))
     if mesh is not None and jax.process_count() == 1:  # no more devices than have work
         mesh = Mesh(mesh.devices[: -(-count // share)], mesh.axis_names)

@@ -68,9 +68,6 @@ class Picture(NamedTuple):
 def picture(place: Section, title: str, caption: str, figure: Figure, choice: str = "") -> Picture:
     """A drawn figure for the page; paths and marks to a hundredth of a point: four fifths of the size."""
     image = io.BytesIO()
-    if (engine := figure.get_layout_engine()) is not None:  # else it is laid out twice, and drawn once for that
-        engine.execute(figure)
-        figure.set_layout_engine("none")
     figure.savefig(image, format="svg")
     rounded = _PLACES.sub(lambda match: _DIGITS.sub(rb"\1", match[0]), image.getvalue())
     return Picture(title, caption, rounded, place, choice, 96 * figure.get_size_inches()[0])

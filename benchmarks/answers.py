@@ -1,8 +1,8 @@
-"""What an answer costs: seconds of a processor, programs and memory, at first, later, and with other recordings.
+"""Print what a command costs at first, later, and with other recordings: processor time, programs and memory.
 
     JAX_NUM_CPU_DEVICES=1 taskset -c 0 python benchmarks/answers.py --table docs/results/answers.md [JOB ...]
 
-An hour on one core of an idle machine.  Each command runs in a process of its own: with no program at hand, with those
+Each command runs in a process of its own: with no program at hand, with those
 of the first run, and without the last two recordings, which no other program may need.
 """
 
@@ -61,11 +61,11 @@ class Run(NamedTuple):
     """One process."""
 
     seconds: float
-    """Of a processor."""
+    """Processor time of the process [s]."""
     programs: int
-    """New in the cache."""
+    """Programs that it put into the cache."""
     memory: float
-    """[GB]"""
+    """Largest memory of the process [GB]."""
     answer: str
 
 

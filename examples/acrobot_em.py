@@ -29,7 +29,7 @@ from nnap_em.fit.predict import given_samples
 from nnap_em.model.base import prepare
 from nnap_em.model.simulate import Experiment, paper_experiment, paper_model
 from nnap_em.numerics.parallel import use_every_device
-from nnap_em.numerics.programs import compile_in_half_the_time
+from nnap_em.numerics.programs import use_older_emitters
 from nnap_em.smoother import AbstractSmoother
 from nnap_em.smoother.gaussian import CubatureSmoother, ExtendedKalmanSmoother, GaussianSmoother
 from nnap_em.smoother.particle import Guided, ParticleSmoother
@@ -343,7 +343,7 @@ def main() -> None:
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
     jax.config.update("jax_enable_x64", True)
-    compile_in_half_the_time()
+    use_older_emitters()
     jax.config.update("jax_num_cpu_devices", cores())
     use_every_device()
     jax.config.update("jax_compilation_cache_dir", str(Path(__file__).resolve().parents[1] / ".cache" / "jax"))

@@ -20,7 +20,7 @@ from nnap_em import identify
 from nnap_em.data.dataset import Dataset
 from nnap_em.data.machine import unpacked
 from nnap_em.data.rig import read_rig
-from nnap_em.numerics.programs import compile_in_half_the_time
+from nnap_em.numerics.programs import use_older_emitters
 from nnap_em.systems import specs
 
 HERE = Path(__file__).resolve().parent / "machines"
@@ -98,7 +98,7 @@ def main() -> None:
     parser.add_argument("--epochs", type=int, default=20)
     args = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
-    compile_in_half_the_time()
+    use_older_emitters()
     case = CASES[args.machine]
     text, law = (HERE / f"{args.machine}.xml").read_text(), friction(case)
     rig = read_rig(HERE / f"{args.machine}.toml", specs)

@@ -22,7 +22,7 @@ import plant
 from matplotlib.figure import Figure
 
 import nnap_em
-from nnap_em.numerics.programs import compile_in_half_the_time
+from nnap_em.numerics.programs import use_older_emitters
 
 STIFFNESS, DAMPING, MOST = 1.5, 0.12, 0.8
 """Gains of the controller [N m/rad, N m s/rad], and its largest torque [N m]."""
@@ -96,7 +96,7 @@ def main() -> int:
     arguments.add_argument("--out", type=Path, default=Path("out/observer"))
     args = arguments.parse_args()
     jax.config.update("jax_enable_x64", True)
-    compile_in_half_the_time()
+    use_older_emitters()
     case = plant.Case(sequences=args.sequences, tests=1, steps=300, seed=args.seed, start="anywhere")
     plant.write(case, args.out / "rig")
     rig = nnap_em.read_rig(args.out / "rig" / "rig.toml")

@@ -45,7 +45,7 @@ def test_a_slide_that_lacks_nothing_is_left_alone(tmp_path):
 
 
 def test_other_recordings_of_the_machine_compile_nothing(tmp_path):
-    """Two more, three rows shorter: the programs of the search of the test before serve."""
+    """The programs of a search serve another data set, of two recordings more and three rows less."""
     case = SLIDE._replace(effects=(DRAG,))
     _closed(case, tmp_path / "first")
     with profiling() as profile:

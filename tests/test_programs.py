@@ -1,4 +1,4 @@
-"""How programs are compiled; they are let go only where they hold too many memory maps."""
+"""Flags of the compiler are set where it knows them; programs are released where they hold too many memory maps."""
 
 import os
 
@@ -28,5 +28,5 @@ def test_programs_are_released_beyond_the_bound(monkeypatch):
 def test_the_older_emitters_are_asked_for_where_they_are_known(version, before, after, monkeypatch):
     monkeypatch.setenv("XLA_FLAGS", before)
     monkeypatch.setattr(programs.version, "__version__", version)
-    programs.compile_in_half_the_time()
+    programs.use_older_emitters()
     assert os.environ["XLA_FLAGS"] == after

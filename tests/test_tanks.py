@@ -10,7 +10,7 @@ from helpers import optimised
 from nnap_em import read_logs, read_rig
 
 NOISE = 0.016
-"""Of a reading [V]."""
+"""Standard deviation of a reading of the simulated level [V]."""
 
 
 def _recordings(rows: int = 256):

@@ -33,7 +33,7 @@ from ..fit.store import AFTER_FILE, MODEL_FILE, Stored, fingerprint, model_file,
 from ..numerics.digits import counted
 from ..numerics.parallel import use_every_device
 from ..numerics.profile import profiling
-from ..numerics.programs import compile_in_half_the_time
+from ..numerics.programs import use_older_emitters
 from ..numerics.traced import use_cache
 from ..report.tables import FRICTION
 from ..storage.cache import Cache
@@ -61,7 +61,7 @@ OPTIONS = ("start", "smoother", "particles", "for", "seconds", "sequences", "see
 def set_up() -> None:
     """64-bit numbers, every core, and programs kept for the next call, traced and compiled, if there is a place."""
     jax.config.update("jax_enable_x64", True)
-    compile_in_half_the_time()
+    use_older_emitters()
     # Devices made of the cores of one machine at most: sequences are dealt out to them, and there are seldom more
     most_devices = 64
     if not jax.distributed.is_initialized():  # or they are dealt out

@@ -113,7 +113,7 @@ def followed(model: StateSpaceModel, prior: ParameterPrior, path: Gaussian, data
 
 
 NUMBERS = 1 << 23
-"""Numbers of the columns of the sequences that are worked on at once: with what follows from them 300 MB."""
+"""Numbers of the columns of the sequences that are worked on at once: 67 MB, and what follows from them."""
 
 
 def at_once(model: StateSpaceModel, columns: int, rows: int) -> int:

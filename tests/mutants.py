@@ -212,16 +212,16 @@ retreat to the model that was refused
 - between(state.best, state.proposal, state.stride)
 + between(state.model, state.proposal, state.stride)
 ## test_fit.py::test_a_fall_along_its_own_path_is_judged_along_the_path_of_the_step
-the path of the model that was tried
-- path = e_step(state.best, data
-+ path = e_step(state.model, data
 a rise along one path counts, however small
 - - abs(np.mean((best - state.top)[both])))
 + )
 ## test_fit.py::test_a_fall_is_judged_once_more_with_all_rows_in_sight_only
 a second look at short horizons, where a fall is cheap
-- rule, used) if seen == longest else
+- rule, used) if kept is not None else
 + rule, used) if True else
+paths of short horizons are kept
+- kept = path if seen == longest and
++ kept = path if
 ## test_fit.py::test_a_sequence_that_was_left_out_refuses_nothing
 lost sequences judge the next model
 - top = np.where(used, loglik, np.nan)

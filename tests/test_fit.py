@@ -89,16 +89,10 @@ class _Along(NamedTuple):
         (-40.0, 1.0, [1, 1, 0], 100.0, False),  # of samples it would be chance
     ],
 )
-def test_a_fall_along_its_own_path_is_judged_along_the_path_of_the_step(monkeypatch, best, tried, used, ess, taken):
+def test_a_fall_along_its_own_path_is_judged_along_the_path_of_the_step(best, tried, used, ess, taken):
     """Likelihoods along different paths differ by what is known of neither."""
-
-    def e_step(model, *_, **__):
-        assert _mass(model) == 1.0  # the step was made from the best
-        return SimpleNamespace(state=PATH)
-
-    monkeypatch.setattr(loop, "e_step", e_step)
     state, used = _state([0.0, 2.0, np.nan], ess=ess), np.array(used) > 0
-    same = lambda: loop._rise(state, DATA, None, _Along(best, tried), used)  # noqa: E731
+    same = lambda: loop._rise(state, PATH, DATA, _Along(best, tried), used)  # noqa: E731
     after = loop._judge(state, _heavy(2.5), jnp.ones((1, 1)), np.array([-9.0, -7.0, -9.0]), used, same)
     assert _mass(after.best) == (1.5 if taken else 1.0)
     assert after.top[0] == (-9.0 if taken else 0.0)
@@ -106,15 +100,17 @@ def test_a_fall_along_its_own_path_is_judged_along_the_path_of_the_step(monkeypa
 
 
 def test_a_fall_is_judged_once_more_with_all_rows_in_sight_only(monkeypatch):
-    horizons, judged = [], []
+    horizons, judged, kept_paths = [], [], []
 
-    def em_step(model, data, *_, **__):
+    def em_step(model, data, *_, kept, **__):
         horizons.append(int(data.valid[0].sum()))
+        kept_paths.append(kept is PATH)
         return (
             model,
             MStepInfo(jnp.ones((1, 1)), np.ones(4, bool)),
             -10.0 * len(horizons) * np.ones(4),
             np.full(4, np.inf),
+            PATH,
         )
 
     monkeypatch.setattr(loop, "em_step", em_step)
@@ -122,6 +118,7 @@ def test_a_fall_is_judged_once_more_with_all_rows_in_sight_only(monkeypatch):
     state = _state(np.full(4, -np.inf), epoch=1)
     loop.fit(state, DATA, CubatureSmoother(StartBank((1, 1))), RULE, epochs=6, schedule=Schedule(first=4, growth=3.0))
     assert horizons == [4, 4, 9, 9, 9] and judged == [9, 9]
+    assert kept_paths == [False, False, False, True, True]
 
 
 def test_a_sequence_that_was_left_out_refuses_nothing():

@@ -191,6 +191,20 @@ def test_the_likelier_side_is_the_one_of_the_grid():
     assert first.loglik[1] < mixture.loglik[1] - 5  # it was on the other side
 
 
+def test_a_kept_path_is_followed_and_the_other_side_is_not_sought():
+    """Right of the mixture's own path and left of it: about the former the same, about its mirror image the mirror."""
+    model, data, bank = _model(mean=0.0), _logs([1], ROWS), StartBank((1,), (0,))
+    smoother = CubatureSmoother(bank)
+    sought = e_step(model, data, smoother, key=KEY)
+    mirrored = sought.state._replace(mean=-sought.state.mean)
+    for side, kept in ((1, sought.state), (-1, mirrored)):
+        about = e_step(model, data, smoother, key=KEY, kept=kept)
+        np.testing.assert_allclose(
+            about.state.mean[0, ROWS // 2 :], side * sought.state.mean[0, ROWS // 2 :], atol=1e-3
+        )
+        np.testing.assert_allclose(about.loglik, sought.loglik, atol=1e-3)
+
+
 def test_the_likelier_of_both_paths_is_taken():
     """Each by the model linearised about itself, one nat to either side; no number is less likely than any."""
     model, data = _model(), _logs([1, -1, 1, -1], 0)

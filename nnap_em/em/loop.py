@@ -19,6 +19,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from ..data.dataset import Dataset, horizon
 from ..model.base import AbstractModel, prepare
+from ..numerics.gaussian import Gaussian
 from ..numerics.parallel import each
 from ..numerics.profile import stage
 from ..numerics.random import keys_of
@@ -88,34 +89,37 @@ def e_step(
     smoother: AbstractSmoother,
     *,
     key: PRNGKeyArray,
+    kept: Gaussian | None = None,
 ) -> Posterior:
     """Smooth every sequence of `data`, on the devices of `parallel.over`, in groups that keep below `smoother.room`.
 
-    Sequences that are too wide for it are smoothed by its second one, too, and the likelier outcome is kept.
+    Sequences that are too wide for it are smoothed by its second one, too, or about the path that was `kept` of that,
+    and the likelier outcome is taken.
     """
-    return _with_mixture(model, data, smoother.second(), _alone(model, data, smoother, key=key))
+    return _with_mixture(model, data, smoother.second(), _alone(model, data, smoother, key=key), kept)
 
 
 def _alone(model: AbstractModel, data: Dataset, smoother: AbstractSmoother, *, key: PRNGKeyArray) -> Posterior:
     """`e_step` without a second smoother."""
-    keys = keys_of(key, data.t.shape[0])
-    outcomes = [_apart(model, data, one, keys) for one in smoother.tries()]
+    batch = data, keys_of(key, data.t.shape[0])
+    together = max(1, smoother.room // (data.t.shape[1] * smoother.bytes_per_row))
+    outcomes = [each(_smooth, (model, one), batch, together=together) for one in smoother.tries()]
     return outcomes[0] if len(outcomes) == 1 else each(_likeliest, None, outcomes)
 
 
-def _apart(model: AbstractModel, data: Dataset, smoother: AbstractSmoother, keys) -> Posterior:
-    """Each sequence by itself."""
-    together = max(1, smoother.room // (data.t.shape[1] * smoother.bytes_per_row))
-    return each(_smooth, (model, smoother), (data, keys), together=together)
-
-
-def _with_mixture(model: AbstractModel, data: Dataset, second: AbstractBranching | None, first: Posterior) -> Posterior:
-    """`first`, with the likeliest path of the second smoother where a sequence is wide."""
+def _with_mixture(
+    model: AbstractModel,
+    data: Dataset,
+    second: AbstractBranching | None,
+    first: Posterior,
+    kept: Gaussian | None = None,
+) -> Posterior:
+    """`first`, with the likeliest path of the second smoother, or that about `kept`, where a sequence is wide."""
     some = beyond(first, second)
     if second is None or not some.size:
         return first
-    wide = jax.tree.map(lambda a: np.asarray(a)[some], (data, first.state))
-    path, loglik = each(_likeliest_path, (model, second), wide, together=1)
+    wide = jax.tree.map(lambda a: np.asarray(a)[some], (data, first.state, *[kept] * (kept is not None)))
+    path, loglik = each(_likeliest_path, (model, second), wide, together=1 if kept is None else None)
     return _replaced(first, path, loglik, some)
 
 
@@ -134,10 +138,9 @@ def _likeliest_path(common, one) -> tuple[Posterior, Float[Array, ""]]:
 
     A relinearisation may diverge, so that the path it began from is compared, too.
     """
-    (model, second), (seq, first) = common, one
-    ready = prepare(model, seq)
-    paths = second.paths(model, ready, first)
-    return jax.tree.map(lambda a: a[likeliest(paths.loglik)], paths), second.loglik(model, ready, first)
+    (model, second), (seq, first, *kept) = common, one
+    paths, before = second.paths(model, prepare(model, seq), first, *kept)
+    return jax.tree.map(lambda a: a[likeliest(paths.loglik)], paths), before[-1]
 
 
 def _replaced(first: Posterior, second: Posterior, loglik: Float[Array, " some"], index) -> Posterior:
@@ -164,7 +167,7 @@ def _smooth(common, one) -> Posterior:
     return smoother(model, prepare(model, seq), key=key)
 
 
-@step(lambda model, *_, **__: (model, MStepInfo(HERE, HERE), HERE, HERE))
+@step(lambda model, *_, **__: (model, MStepInfo(HERE, HERE), HERE, HERE, Gaussian(HERE, HERE)))
 def em_step(
     model: AbstractModel,
     data: Dataset,
@@ -172,17 +175,19 @@ def em_step(
     m_step: AbstractMStep,
     key: PRNGKeyArray,
     *,
+    kept: Gaussian | None = None,
     growing: bool = False,
-) -> tuple[AbstractModel, MStepInfo, Float[Array, " seq"], Float[Array, " seq"]]:
-    """One E-step and one M-step: the next model, the log-likelihoods of this one and the effective sample sizes.
+) -> tuple[AbstractModel, MStepInfo, Float[Array, " seq"], Float[Array, " seq"], Gaussian]:
+    """One E-step and one M-step: the next model, the log-likelihoods of this one, the effective sample sizes, and the
+    smoothed paths.
 
     Each is compiled by itself: what does not depend on the structure of the model is compiled once for all. While the
     horizon is `growing`, no sequence is smoothed a second time: the noise is still so large that all are wide.
     `step` keeps the result in the journal of a command, from which `--resume` continues; elsewhere it does nothing.
     """
-    posterior = (_alone if growing else e_step)(model, data, smoother, key=key)
+    posterior = _alone(model, data, smoother, key=key) if growing else e_step(model, data, smoother, key=key, kept=kept)
     model, info = m_step(model, posterior, data)
-    return model, info, posterior.loglik, posterior.ess
+    return model, info, posterior.loglik, posterior.ess, posterior.state
 
 
 def start_state(model: AbstractModel, m_step: AbstractMStep, *, key: PRNGKeyArray) -> EMState:
@@ -230,6 +235,7 @@ def fit(
     if state.epoch == 0:
         model = _settle_noise(state.model, horizon(data, schedule.first, still), smoother, state.key)
         state = state._replace(model=model, best=model)
+    kept = None
     held_rest = 0.5  # the same before the M-step is released: likelihoods are compared no more exactly
     while state.epoch < epochs:
         seen = schedule.horizon(state.epoch, longest)
@@ -244,9 +250,8 @@ def fit(
             state = _released(state)
         rule, key = stages[state.stage], jax.random.fold_in(state.key, state.epoch)
         rule = rule.while_growing() if seen < longest else rule
-        proposal, info, loglik, ess = em_step(
-            state.model, horizon(data, seen, still), smoother, rule, key, growing=seen < longest
-        )
+        part, options = horizon(data, seen, still), {"kept": kept, "growing": seen < longest}
+        proposal, info, loglik, ess, path = em_step(state.model, part, smoother, rule, key, **options)
         used = np.asarray(info.used)
         if not used.any():
             raise FitError(
@@ -254,8 +259,9 @@ def fit(
                 "check units, signs and the start prior, or declare a wider one"
             )
         state = state._replace(ess=float(np.mean(np.asarray(ess)[used])))
-        same = functools.partial(_rise, state, data, smoother, rule, used) if seen == longest else lambda: -math.inf
-        state = _judge(state, proposal, info.hessian, np.asarray(loglik), used, same)
+        same = functools.partial(_rise, state, kept, data, rule, used) if kept is not None else lambda: -math.inf
+        tried, state = state.model, _judge(state, proposal, info.hessian, np.asarray(loglik), used, same)
+        kept = path if seen == longest and state.best is tried else kept
         watch(state, seen, used)
     return state._replace(stop=SPENT)
 
@@ -287,16 +293,15 @@ def unsettled(state: EMState, schedule: Schedule, longest: int) -> float:
     return rise if rise >= least else 0.0
 
 
-def _rise(state: EMState, data: Dataset, smoother, rule, used: Bool[np.ndarray, " seq"]) -> float:
+def _rise(state: EMState, path: Gaussian, data: Dataset, rule, used: Bool[np.ndarray, " seq"]) -> float:
     """Rise of the log-likelihood from the best model to the one that was tried, beyond what is known [nat a sequence].
 
-    Both are linearised about the path from which the step was made. The likelihood of the best one changes when it is
+    Both are linearised about the `path` from which the step was made. The likelihood of the best one changes when it is
     linearised about that path, too, and is known no better: on a real arm with steep friction than 50 nat. -inf where a
     sequence was lost, or for samples.
     """
     if np.any(np.isfinite(state.top) & ~used) or math.isfinite(state.ess):
         return -math.inf
-    path = e_step(state.best, data, smoother, key=state.key).state
     best, tried = (np.asarray(rule.loglik(model, path, data)) for model in (state.best, state.model))
     both = used & np.isfinite(state.top)
     return float(np.mean((tried - best)[both]) - abs(np.mean((best - state.top)[both])))

@@ -93,5 +93,5 @@ def distance(a: Float[np.ndarray, "time angle"], b: Float[np.ndarray, "time angl
 def _paths(common, one) -> tuple[Float[Array, "path time state"], Float[Array, " path"]]:
     """Means of the paths of one sequence, and their log-likelihoods."""
     (model, second), (seq, first) = common, one
-    paths = second.paths(model, prepare(model, seq), first)
+    paths, _ = second.paths(model, prepare(model, seq), first)
     return paths.state.mean, paths.loglik

@@ -192,7 +192,7 @@ def finished(fitted: Identified, data: Dataset) -> Identified:
     if falls and np.mean(falls) < 1 - LEAST_FALL:
         along = finish(fitted.model, fitted.m_step, path, data, used, shaped=True)
         model, before = along.model, errors(along, JUDGED)
-        posterior = e_step(model, data, fitted.smoother.tolerant(), key=fitted.state.key)
+        posterior = e_step(model, data, fitted.smoother.tolerant(), key=fitted.state.key, kept=path)
         _, info = fitted.m_step(model, posterior, data)  # a curvature belongs to the weights at which it was taken
         top = np.where(np.asarray(info.used), np.asarray(posterior.loglik), np.nan)
         fitted = fitted._replace(state=fitted.state._replace(best=model, hessian=info.hessian, top=top))

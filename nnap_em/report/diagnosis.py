@@ -15,6 +15,7 @@ from ..diagnosis.interventions import Intervention
 from ..diagnosis.keys import Key, key_of, place_of, words
 from ..diagnosis.outcome import Diagnosis, Step
 from ..diagnosis.residual import Names, Residual, names_of, residual
+from ..diagnosis.search import unbranched
 from ..fit.identify import FrictionTable, friction_table
 from ..fit.misfit import moved
 from ..fit.predict import GIVEN, Prediction
@@ -49,7 +50,8 @@ def write_diagnosis(
     error = errors(predicted, sides, test) if test else None
     if error:
         error.setdefault("after", error["before"])
-    left = {name: residual(fitted, train.data) for name, fitted in sides.items()}
+    searched = {name: fitted._replace(smoother=unbranched(fitted.bank)) for name, fitted in sides.items()}
+    left = {name: residual(fitted, train.data) for name, fitted in searched.items()}
     partial = left["after"].without_effects() if accepted else left["before"]
     tested = {name: tests(each, names) for name, each in left.items()}
     before, dof = left["before"], len(names.rates)

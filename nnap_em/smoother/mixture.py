@@ -20,7 +20,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from ..model.base import AbstractModel, Prepared
 from ..numerics.gaussian import Gaussian, cholesky, lower
-from .kalman import Cubature, Filtered, Tangent, absorbed, linear_reading, moved, relinearised, rts
+from .kalman import Cubature, Filtered, Smoothed, Tangent, absorbed, linear_reading, moved, relinearised, rts
 from .linear import linear_posterior
 from .posterior import AbstractBranching, Posterior, likeliest
 
@@ -202,33 +202,42 @@ class MixtureSmoother(AbstractBranching):
         """Places of the angles in which paths differ."""
         return self.places
 
-    def paths(self, model: AbstractModel, seq: Prepared, first: Gaussian | None = None) -> Posterior:
-        """Posterior along the ancestors of every final component, and about the path `first`, with a leading axis."""
-        start = jax.tree.map(lambda a: jnp.broadcast_to(a, (self.components, *a.shape)), model.start)
-        log_weight = jnp.where(jnp.arange(self.components) == 0, 0.0, -jnp.inf)
-        tree = mixture_filter(model, start, log_weight, seq, self.linearise, self.angles, self.wide)
-        paths = jax.vmap(lambda last: branch(tree, last))(jnp.arange(self.components))
-        smoothed, followed = jax.vmap(rts)(paths), jnp.isfinite(tree.log_weight)
+    def paths(
+        self, model: AbstractModel, seq: Prepared, first: Gaussian | None = None, kept: Gaussian | None = None
+    ) -> tuple[Posterior, Float[Array, " path"]]:
+        """Posterior along the ancestors of every final component, or about `kept`, and about `first`."""
+        if kept is None:
+            start = jax.tree.map(lambda a: jnp.broadcast_to(a, (self.components, *a.shape)), model.start)
+            log_weight = jnp.where(jnp.arange(self.components) == 0, 0.0, -jnp.inf)
+            tree = mixture_filter(model, start, log_weight, seq, self.linearise, self.angles, self.wide)
+            ends = jnp.arange(self.components)
+            paths = jax.vmap(lambda last: rts(branch(tree, last)).state)(ends)
+            followed = jnp.isfinite(tree.log_weight)
+        else:
+            paths, followed = jax.tree.map(lambda a: a[None], kept), jnp.ones(1, bool)
         if first is not None:
-            paths, smoothed = jax.tree.map(lambda a: jnp.concatenate([a, a[:1]]), (paths, smoothed))
-            smoothed = smoothed._replace(state=jax.tree.map(lambda a, b: a.at[-1].set(b), smoothed.state, first))
+            paths = jax.tree.map(lambda a, b: jnp.concatenate([a, b[None]]), paths, first)
             followed = jnp.append(followed, True)
+        every, before = jax.vmap(lambda path: self._about(model, seq, path))(paths)
+        return every._replace(loglik=jnp.where(followed, every.loglik, -jnp.inf)), before
 
-        def follow(filtered, smoothed, followed):
-            def again(_, last):
-                filtered = relinearised(model, last[1].state, seq, self.linearise)
-                return filtered, rts(filtered)
+    def _about(self, model: AbstractModel, seq: Prepared, path: Gaussian) -> tuple[Posterior, Float[Array, ""]]:
+        """The posterior relinearised about a path, and the likelihood of the model linearised about that itself."""
 
-            posterior = linear_posterior(*jax.lax.fori_loop(0, self.iterations, again, (filtered, smoothed)))
-            return posterior._replace(loglik=jnp.where(followed, self.loglik(model, seq, posterior.state), -jnp.inf))
+        def once(path: Gaussian) -> tuple[Filtered, Smoothed]:
+            filtered = relinearised(model, path, seq, self.linearise)
+            return filtered, rts(filtered)
 
-        return jax.vmap(follow)(paths, smoothed, followed)
+        def again(last, _):
+            both = once(last[1].state)
+            return both, both[0].loglik
 
-    def loglik(self, model: AbstractModel, seq: Prepared, path: Gaussian) -> Float[Array, ""]:
-        """Log-likelihood of the readings by the model linearised about `path`."""
-        return relinearised(model, path, seq, self.linearise).loglik
+        filtered, smoothed = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(once, path))
+        begin = filtered, smoothed._replace(state=path)
+        last, loglik = jax.lax.scan(again, begin, None, length=self.iterations + 1)
+        return linear_posterior(*last), loglik[0]
 
     def __call__(self, model: AbstractModel, seq: Prepared, *, key: PRNGKeyArray | None = None) -> Posterior:
         """Smooth one sequence; it draws nothing."""
-        paths = self.paths(model, seq)
+        paths, _ = self.paths(model, seq)
         return jax.tree.map(lambda a: a[likeliest(paths.loglik)], paths)

@@ -80,14 +80,13 @@ class AbstractBranching(AbstractSmoother):
         """Places of the angles in which paths differ."""
 
     @abstractmethod
-    def paths(self, model: AbstractModel, seq: Prepared, first: Gaussian | None = None) -> Posterior:
-        """The posterior about each of several paths, and about the path `first`, with a leading axis; the likelihood is
-        that of the model linearised about the path itself, and -inf where there is none.
+    def paths(
+        self, model: AbstractModel, seq: Prepared, first: Gaussian | None = None, kept: Gaussian | None = None
+    ) -> tuple[Posterior, Float[Array, " path"]]:
+        """The posterior about each of several paths, or about the path `kept` alone, and about the path `first`, with a
+        leading axis; the likelihood is that of the model linearised about the path itself, and -inf where there is
+        none. With it the likelihoods about the paths that these began from.
         """
-
-    @abstractmethod
-    def loglik(self, model: AbstractModel, seq: Prepared, path: Gaussian) -> Float[Array, ""]:
-        """Log-likelihood of the readings by the model linearised about `path`."""
 
 
 def likeliest(score: Float[Array, " candidate"]) -> Int[Array, ""]:

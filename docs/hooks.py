@@ -15,7 +15,7 @@ from latex2mathml.converter import convert_to_element
 
 from nnap_em.commands.cli import parser
 from nnap_em.effects import catalogue
-from nnap_em.export.placement import NO_PLACE, PLACES
+from nnap_em.export.placement import PLACES
 
 ROOT = Path(__file__).resolve().parents[1]
 BAR = r"\|"
@@ -79,10 +79,8 @@ def effects() -> str:
 
 
 def _place(name: str) -> str:
-    """Place of a law in MuJoCo, or the reason why it has none."""
-    if name in PLACES:
-        return (PLACES[name].__doc__ or "").partition("\n")[0]
-    return f"None: {NO_PLACE.get(name, 'no element of MuJoCo has this form')}."
+    """Place of a law in MuJoCo, if it has one."""
+    return (PLACES[name].__doc__ or "").partition("\n")[0] if name in PLACES else "-"
 
 
 def verdict() -> str:

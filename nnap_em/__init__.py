@@ -16,12 +16,11 @@ if TYPE_CHECKING:
     from .data.logs import read_logs
     from .data.rig import Rig, write_rig
     from .diagnosis.findings import findings
-    from .diagnosis.memory import identify
     from .diagnosis.outcome import Diagnosis
     from .diagnosis.search import diagnose
     from .experiment.experiment import design
     from .fit.check import check
-    from .fit.identify import Identified, friction_table, parameter_table
+    from .fit.identify import Identified, friction_table, identify, parameter_table
     from .fit.known import identify_from
     from .fit.observer import observer
     from .fit.predict import horizon_errors, predict, smooth
@@ -72,11 +71,10 @@ _homes = {
     "data.logs": ("read_logs",),
     "data.rig": ("Rig", "write_rig"),
     "diagnosis.findings": ("findings",),
-    "diagnosis.memory": ("identify",),
     "diagnosis.outcome": ("Diagnosis",),
     "diagnosis.search": ("diagnose",),
     "experiment.experiment": ("design",),
-    "fit.identify": ("Identified", "friction_table", "parameter_table"),
+    "fit.identify": ("Identified", "friction_table", "identify", "parameter_table"),
     "fit.known": ("identify_from",),
     "fit.observer": ("observer",),
     "fit.predict": ("horizon_errors", "predict", "smooth"),

@@ -17,7 +17,6 @@ SECONDS = {
     "test_machines.py": 80,
     "test_docs.py": 60,
     "test_calibration.py": 60,
-    "test_memory.py": 60,
     "test_online.py": 60,
     "test_written_back.py": 54,
     "test_measured.py": 50,

@@ -282,7 +282,7 @@ def test_logs_that_the_model_cannot_follow_are_an_error_and_no_warning_of_numpy(
     monkeypatch.setattr(check_module, "each", lambda *_, **__: lost)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        report = _report(logs, replace(rig, memory=True))
+        report = _report(logs, rig)
     assert report["states"][0] == (
         "error",
         "the declared model cannot follow the logs; look at units, signs and parameters",

@@ -112,7 +112,7 @@ def test_public_names_are_what_they_say():
         assert isinstance(value, type(sys)) == (name in nnap_em._namespaces), name
         assert name in dir(nnap_em)
     from nnap_em import identify
-    from nnap_em.diagnosis.memory import identify as same
+    from nnap_em.fit.identify import identify as same
 
     assert identify is same
     with pytest.raises(AttributeError, match="no attribute 'identity'"):

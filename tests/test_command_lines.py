@@ -87,7 +87,6 @@ VALUES: dict[str, list[str]] = {
 GOES_WITH = {
     ("identify", "--particles"): "--smoother",
     ("diagnose", "--logs"): "--from",
-    ("export", "--alone"): "--mjcf",
     ("export", "--float"): "--observer",
 }
 """Options that are refused without another."""
@@ -336,7 +335,6 @@ def test_the_source_of_an_observer_includes_the_header_that_is_written(name, lig
 @pytest.mark.parametrize(
     "line, reason",
     {
-        "export fit --out x --alone": "--alone goes with --mjcf FILE",
         "export fit --out x --float": "--float goes with --observer FILE",
         "diagnose bench --out x --logs bench": "--logs goes with --from FIT",
         "identify bench --out x --particles 3": "--particles goes with --smoother particle",

@@ -16,7 +16,7 @@ FOLDERS = ("numerics", "storage", "data", "machines", "import_", "systems", "eff
 PACKAGE = ROOT / "nnap_em"
 
 
-LINES, CONSTANTS = 33_430, 353
+LINES, CONSTANTS = 32_636, 344
 """Lines and module constants of the package: they may fall, and then these fall with them."""
 
 

@@ -16,7 +16,6 @@ from nnap_em.fit.identify import begin
 from nnap_em.fit.observer import AMBIGUOUS, MISSING, NO_INPUT, OUTLIER, RESTARTED, functions, observer, restart_prior
 from nnap_em.model import hooks
 from nnap_em.model.base import prepare
-from nnap_em.model.dynamic_friction import DynamicFriction
 from nnap_em.model.servo import Servo
 from nnap_em.model.simulate import paper_experiment, paper_model
 from nnap_em.model.state_space import with_effects
@@ -72,22 +71,14 @@ LAWS = {
     ),
     "a torque of a late servo": ((), (Servo("f", "torque", {"delay": NUMBER(0.03)}),)),
     "a gain from a column": ((), (Servo("goal", "position", {"kp": NUMBER(8.0)}, (("kp", 0, 0.2),)),)),
-    "a bristle": ((catalogue["presliding_friction"],), None),
+    "a bristle": ((catalogue["presliding_friction"].of(1.0, 0.1, 0.2, 0.1, 0.5, 200.0, joint=1),), None),
 }  # fmt: skip
 
 
 @pytest.fixture(params=LAWS)
 def dressed(request):
     effects, servos = LAWS[request.param]
-    if request.param == "a bristle":
-        effects = (_bristle(),)
     return _model(effects, servos), 2 if request.param == "a gain from a column" else 1
-
-
-def _bristle():
-    numbers = dict(log_level=-1.0, log_distance=-4.0, log_damping=-3.0, log_rise=-1.0, log_velocity=-2.0)
-    known = dict(knee=NUMBER(0.1), stiffest=NUMBER(1e3), fastest=NUMBER(1e3))
-    return DynamicFriction(**{k: NUMBER(v) for k, v in numbers.items()}, shape=jnp.zeros(5), **known, joint=1)
 
 
 @pytest.mark.parametrize(

@@ -145,7 +145,6 @@ def parser() -> argparse.ArgumentParser:
     _file(export, "model", "MODEL", "model.npz, or the folder that holds it")
     _file(export, "--out", "OUT", "folder for the files")
     _file(export, "--mjcf", "FILE", "write a machine that came from a file back as MJCF")
-    export.add_argument("--alone", action="store_true", help="refuse laws that MuJoCo has no place for")
     _file(export, "--urdf", "FILE", "write such a machine as URDF")
     _file(export, "--c", "FILE", "friction and feed-forward torque, or equations, as C99")
     _file(export, "--observer", "FILE", "write an online estimator of the states as C99")
@@ -162,7 +161,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     for command, option, needed, what in (
         ("identify", "particles", lambda: args.smoother == "particle", "--smoother particle"),
         ("diagnose", "logs", lambda: args.start, "--from FIT"),
-        ("export", "alone", lambda: args.mjcf, "--mjcf FILE"),
         ("export", "float", lambda: args.observer, "--observer FILE"),
     ):
         if args.command == command and getattr(args, option) and not needed():

@@ -11,7 +11,6 @@ OUT gets parameters.json: all numbers with their units.
 """
 
 import argparse
-from functools import partial
 
 from ..export.c99 import write_c
 from ..export.mjcf import write_mjcf
@@ -30,7 +29,7 @@ def run(args: argparse.Namespace, log: Log) -> None:
         if getattr(args, option) is not None:
             require_joints(fitted.rig, f"--{option}")
     for path, write, problem in (
-        (args.mjcf, partial(write_mjcf, alone=args.alone), "has no place for"),
+        (args.mjcf, write_mjcf, "has no place for"),
         (args.urdf, write_urdf, "has no place for"),
         (args.c, write_c, "leaves out"),
     ):

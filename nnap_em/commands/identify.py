@@ -23,7 +23,6 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ..data.rig import Rig
-from ..diagnosis.memory import with_memory
 from ..em.loop import EMState
 from ..fit.identify import MakeSmoother, Watch, identify
 from ..fit.known import identify_from
@@ -49,8 +48,6 @@ def run(args: argparse.Namespace, log: Log) -> int:
         options = {"key": key, "smoother": smoother(args), "epochs": args.epochs, "watch": watch}
         begin = identify if start is None else functools.partial(identify_from, start.fitted)
         fitted = begin(bench.rig, data, **options)
-        if bench.rig.memory and start is None:
-            fitted = with_memory(fitted, data, log)
         remove_reports(args.out)
         settings = {"smoother": args.smoother, "particles": args.particles, "seed": args.seed}
         notes = {"settings": settings, "epochs": epochs, "logs": logs_at(args)}

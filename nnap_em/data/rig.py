@@ -36,7 +36,7 @@ _HINTS = {  # how the line of a key or table should look
     "limits": "a table [limits] with lines such as u = 0.3 or theta1 = [-2.0, 2.0]",
     "rate": "a table [limits.rate] with lines such as u = 5.0 (N m/s)",
     "type": 'type = "acrobot"',
-    "friction": 'friction = "unknown" (to be learned), friction = "dynamic" (with memory) or friction = "none"',
+    "friction": 'friction = "unknown" (to be learned) or friction = "none"',
     "actuated_joint": "actuated_joint = 2 (or a table [input] with columns and joints)",
     "columns": 'a list of different names, columns = ["theta1", "dtheta1"]',
     "joints": "a list of different joints, one per column, joints = [1, 2]",
@@ -121,7 +121,6 @@ class Rig:
     limits: Bounds = UNBOUNDED  # of designed experiments; what is absent: as far as the logs went
     machine: str = ""  # of a system that is read from its owner's file: all of it, as `machine.packed` writes it
     input_kinds: tuple[str, ...] = ()  # of `servo.KINDS`, one per column; none given: all are torques
-    memory: bool = False  # True: friction may have a hidden state in each joint
     # columns that a number of a servo ("goal.kp") is proportional to, each with its value where it is as declared
     input_scales: Mapping[str, Mapping[str, float]] = dataclasses.field(default_factory=dict)
     equations: str = ""  # of a plant that is written as equations: all of them, as `equations.Text.packed` writes them
@@ -204,7 +203,7 @@ class Rig:
             f"inputs: {', '.join(inputs) or 'none'}",
             f"reads: {', '.join(reads)}",
             f"start: {quantities(self.start, self.unit) or 'from the readings'}",
-            f"friction: {'to be learned' if self.friction else 'none'}{', with memory' if self.memory else ''}",
+            f"friction: {'to be learned' if self.friction else 'none'}",
         ]
         return "\n  ".join(lines)
 
@@ -226,7 +225,7 @@ def read_rig(path: Path | str, systems: Mapping[str, SystemSpec]) -> Rig:
     sampling.check(("dt", "input_hold", "clock"), ("horizon",) if declaration.equations else ())
     start.check((), spec.states)
     measured, noise_std, ranges = _measurement(root.table("measurement"), spec, bool(declaration.equations))
-    kinds = ("unknown", "dynamic", "none")
+    kinds = ("unknown", "none")
     friction = "none" if declaration.equations else model.choice("friction", kinds)
     clocks = ("sequence", "session")
     rig = Rig(
@@ -245,7 +244,6 @@ def read_rig(path: Path | str, systems: Mapping[str, SystemSpec]) -> Rig:
         limits=read_bounds(root.table("limits", absent={}), declaration.input_columns, spec.states),
         machine=declaration.machine,
         input_kinds=declaration.input_kinds,
-        memory=friction == "dynamic",
         input_scales=declaration.input_scales,
         equations=declaration.equations,
         ranges=ranges,
@@ -304,9 +302,8 @@ def write_rig(rig: Rig, path: Path | str) -> None:
 
 def _joints(rig: Rig, parameters: Mapping[str, str], bodies: Sequence[str]) -> list[str]:
     """Friction and inputs of a machine with joints."""
-    friction = "dynamic" if rig.memory else "unknown" if rig.friction else "none"
-    kind = "map with memory" if rig.memory else "static map velocity -> torque"
-    lines = [f'friction = "{friction}"    # {kind} in each joint']
+    friction = "unknown" if rig.friction else "none"
+    lines = [f'friction = "{friction}"    # static map velocity -> torque in each joint']
     lines += ["", "[model.uncertain]", *bodies] if rig.machine and bodies else []
     unit = "" if rig.input_kinds else "    # N m, or N on a slide"
     lines += ["", "[input]", f"columns = [{', '.join(map(toml_text, rig.input_columns))}]{unit}"]

@@ -107,7 +107,7 @@ def _in_place(context: SearchContext, law: Key, evidence: Evidence, fit: Smoothe
     was compared with that when it was found.  Of each the best candidate.
     """
     around = surroundings(context.before.rig, fit.model, fit.data, fit.path, fit.rows, change=context.change)
-    every = proposals(around, fit.model.effects, context.kinds)
+    every = proposals(around, fit.model.effects)
     keyed = [(key_of(c.start), c) for c in every if c.start.visible(around)]
     some = [c for key, c in keyed if key in evidence.equivalent or (fit.model.effects and elsewhere(key, law))]
     listed = screen(context.loss, fit, some, shifts=0) if some else ()

@@ -2,7 +2,7 @@
 
 import functools
 import math
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple, TypeVar, cast
 
 import equinox as eqx
@@ -12,7 +12,6 @@ from jaxtyping import Bool, Float
 from scipy import stats
 
 from ..data.dataset import Dataset, horizon
-from ..effects import AbstractEffect, catalogue
 from ..em.loop import SCHEDULE, EMState, FitError, Schedule, e_step, fit, later_state, start_state
 from ..em.mstep import not_diverged
 from ..em.multistep import JUDGED, LEAST_FALL, errors, followed, ratio
@@ -74,8 +73,6 @@ class SearchContext(NamedTuple):
     """True where readings carry white noise: what likelihood states then holds, and short horizons of hidden joints."""
     risen: Risen | None = None
     """Test of whether errors have risen since that fit; None where its recordings are not at hand."""
-    kinds: Collection[type[AbstractEffect]] = catalogue.values()
-    """Laws that are tried."""
 
     @property
     def functions(self) -> bool:

@@ -1,6 +1,5 @@
 """A model with what was added to it: every addition is one record of law, prior and evidence."""
 
-import functools
 import math
 from typing import NamedTuple
 
@@ -74,7 +73,6 @@ class Hypothesis(NamedTuple):
             jnp.concatenate([prior.std[:declared], *(a.std for a in additions)]),
         )
         model, first = with_effects(self.model, tuple(a.effect for a in additions)), self.m_step.log_q_prior
-        model = functools.reduce(lambda model, effect: effect.beside(model), model.effects, model)
         own = 2 * len(model.system.coordinates)  # noise of a memory has no ratio to hold
         shape = model.log_q if first is None else model.log_q.at[:own].set(first[:own])
         rule = eqx.tree_at(

@@ -38,7 +38,7 @@ def screening_round(fit: SmoothedFit, context: SearchContext) -> Round:
     """Screen everything that the machine may have, and refit the best until one is accepted."""
     rig, model = context.before.rig, fit.model
     around = surroundings(rig, model, fit.data, fit.path, fit.rows, change=context.change)
-    seen = screen(context.loss, fit, proposals(around, model.effects, context.kinds))
+    seen = screen(context.loss, fit, proposals(around, model.effects))
     fresh = [s for s in seen if s.candidate.start.visible(around) and _fresh(s.candidate.start, fit)]
     ranked = best_of_kind(s for s in fresh if seeded(s.candidate, s.coefficients).is_physical())
     length = int(np.max(np.sum(np.asarray(fit.data.valid), axis=1)))

@@ -17,7 +17,6 @@ from scipy import stats
 from ..data.dataset import Dataset, stepped
 from ..data.logs import Logs, sequences_of
 from ..data.rig import Rig
-from ..effects.sensor import SensorQuantization
 from ..em.loop import EMState, FitError, e_step
 from ..em.mstep import not_diverged
 from ..em.noise import white_readings
@@ -102,8 +101,7 @@ def search(context: SearchContext, *, release: Callable[[Identified, Dataset], I
     """Search for what the declared model lacks, by multi-step errors; `release` ends the fit of the outcome."""
     before = context.before
     try:  # steps of readings as noise: they spoil the noise that all else leans on
-        steps_tried = SensorQuantization in context.kinds and not context.change
-        begun = quantised(context, context.declared) if steps_tried else (context.declared, None)
+        begun = (context.declared, None) if context.change else quantised(context, context.declared)
     except FAILURES as error:
         context.log(f"  with steps of readings as noise the fit fails ({error})")
         begun = context.declared, None
@@ -277,9 +275,6 @@ def diagnose(
         True
     """
     end = time.monotonic() + seconds
-    if start is None and rig.memory:  # the search has a law with memory of its own
-        log("friction is learned as a static map; the search tries memory as the law presliding_friction")
-        rig = dataclasses.replace(rig, memory=False)
     data = Dataset(*map(jax.device_put, stepped(sequences_of(data, rig))))
     stages: Stages = {}
 

@@ -302,14 +302,6 @@ class AbstractEffect(eqx.Module):
         """Time derivative of its own states."""
         return memory
 
-    def beside(self, model: Any) -> Any:
-        """The model that it joins, without what it takes the place of."""
-        return model
-
-    def sliding(self, v: Float[Array, " dof"]) -> Float[Array, " dof"]:
-        """Part of friction in steady sliding at `v` [rad/s] that the learned map leaves to it [N m]."""
-        return jnp.zeros_like(v)
-
     def reading(self, value: Scalar, past: Callable[[Scalar], Scalar]) -> Scalar:
         """Reading of the sensor of its channel; `past(delay)` is the value some seconds ago."""
         return value

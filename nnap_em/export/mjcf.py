@@ -1,7 +1,7 @@
-"""An identified machine written back as MJCF: bodies, friction, and every law that MuJoCo has a place for."""
+"""An identified machine written back as MJCF: bodies, friction, and laws that MuJoCo has a plain element for."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -12,26 +12,15 @@ from jaxtyping import Float
 from .. import __version__
 from ..data.servo import TORQUE
 from ..effects import AbstractEffect
-from ..effects.presliding import PreslidingFriction
 from ..fit.identify import Identified
 from ..machines.spec import compiled, in_comment, mujoco, written
 from ..model import hooks
 from ..model.state_space import StateSpaceModel
 from ..storage.files import replace_own
 from ..systems.tree import Tree
-from .actuator import actuator
 from .friction import REPORTED_MISS, FrictionForm, friction_forms
 from .model import ExportError
-from .placement import Drive, OpenFile, acting_on, late, passive, placed, rotor, sensor
-
-LONGEST_STEP = 5e-4
-"""Longest time step of a written file [s]."""
-LARGEST_RELAXATION = 1.5
-"""Largest relaxation of a bristle in a time step; beyond 2.8 the integrator diverges [1]."""
-
-
-Bristle = tuple[float, float]
-"""Stiffness [N m/rad or N/m] and damping [N m s/rad or N s/m] of a LuGre bristle."""
+from .placement import Drive, OpenFile, acting_on, late, placed, sensor
 
 
 class Motor(NamedTuple):
@@ -47,22 +36,18 @@ class Motor(NamedTuple):
     """Kind of the actuator in the file that came in, one of `servo.KINDS`."""
 
 
-def write_mjcf(fitted: Identified, out: Path | str, *, alone: bool = False) -> list[str]:
+def write_mjcf(fitted: Identified, out: Path | str) -> list[str]:
     """Write the identified machine to an MJCF file.
-
-    Laws without a place go to a Python module beside it, `OUT_actuator.py`.
 
     Args:
         fitted: the model, of a machine from a file.
         out: the file.
-        alone: write no module.
 
     Returns:
-        Effects that MuJoCo cannot express, a sentence each.
+        What is not in it, a sentence each: laws without a plain element in MuJoCo, and what its friction misses.
 
     Raises:
-        ExportError: the machine did not come from a file; with `alone`, a law has no place in MuJoCo. Nothing is
-            written.
+        ExportError: the machine did not come from a file. Nothing is written.
     """
     out, model = Path(out), fitted.model
     system, forms = as_it_is(fitted, model), friction_forms(fitted)
@@ -72,28 +57,20 @@ def write_mjcf(fitted: Identified, out: Path | str, *, alone: bool = False) -> l
         )
     if not fitted.rig.file:
         raise ExportError("it is from before fits held their machine's file; identify again")
-    file, bristles = _opened(fitted, model, system, forms)
+    file = _opened(fitted, model, system, forms)
     unplaced = placed(file, model.effects)
-    if alone and unplaced:
-        effect, reason = unplaced[0]
-        raise ExportError(
-            f"{named(effect)} has no place in MuJoCo ({reason}); leave out --alone to have {beside(out).name} play it, "
-            "or diagnose again without this law"
-        )
     left = [
         f"friction of {name}: its form misses {100 * form.missed:.0f} % of the learned curve"
         for name, form in zip(system.coordinates, forms, strict=True)
         if form.missed > REPORTED_MISS
     ]
-    acting = actuator(fitted, model, unplaced, motors_of(fitted, system)) if unplaced else None
     left += [
-        f"{named(effect)} ({reason}): {beside(out).name if acting and effect in acting.plays else 'nothing'} plays it"
-        for effect, reason in unplaced
+        f"breakaway of {name}: {form.breakaway:.3g} over a Coulomb friction of {form.coulomb:.3g}"
+        for name, form in zip(system.coordinates, forms, strict=True)
+        if form.breakaway > form.coulomb
     ]
+    left += [f"{named(effect)} ({reason})" for effect, reason in unplaced]
     _springs(file)
-    for j, bristle in bristles.items():
-        numbers = (*bristle, _level(forms[j]), forms[j].breakaway, forms[j].stribeck)
-        passive(file, system.machine.joints[j].name, "bristle", lugre=numbers)
     _noise(file, np.exp(0.5 * np.asarray(model.log_r)))
     for motor, element in zip(motors_of(fitted, system), list(file.spec.actuators), strict=False):
         _motor(file, motor, element)
@@ -101,14 +78,8 @@ def write_mjcf(fitted: Identified, out: Path | str, *, alone: bool = False) -> l
     comment = f"Written by nnap_em {__version__} from {system.machine.file}.  Not in here:{notes} "
     file.spec.comment = f"{file.spec.comment}\n {in_comment(comment)}"
     file.spec.compile()
-    module = {beside(out): acting.text} if acting and acting.plays else {}
-    replace_own({**module, out: written(file.spec, out.parent)})
+    replace_own({out: written(file.spec, out.parent)})
     return left
-
-
-def beside(out: Path) -> Path:
-    """The Python module beside a written file."""
-    return out.with_name(f"{out.stem.replace('-', '_')}_actuator.py")
 
 
 def as_it_is(fitted: Identified, model: StateSpaceModel) -> Tree:
@@ -145,34 +116,30 @@ def named(effect: AbstractEffect) -> str:
     return f"{effect.name}{at}{': ' + values if values else ''}"
 
 
-def _opened(
-    fitted: Identified, model: StateSpaceModel, system: Tree, forms: Sequence[FrictionForm]
-) -> tuple[OpenFile, Mapping[int, Bristle]]:
-    """The machine's file with the numbers of the fit, before its laws, and the bristles of its joints."""
+def _opened(fitted: Identified, model: StateSpaceModel, system: Tree, forms: Sequence[FrictionForm]) -> OpenFile:
+    """The machine's file with the numbers of the fit, before its laws."""
     spec, machine = mujoco().MjSpec.from_string(fitted.rig.file), system.machine
     simulated = compiled(Path(machine.file), spec)
     _bodies(simulated, system)
-    still = jnp.asarray([joint.zero for joint in machine.joints], float)
-    mobility, bristles = np.diagonal(np.linalg.inv(np.asarray(system.mass(still)))), {}
     for j, (joint, form) in enumerate(zip(machine.joints, forms, strict=True)):
-        bristles |= _bristle(j, form, model, 1 / mobility[j])
         simulated.dof_armature[j] = float(system.values.get(f"{joint.name}.armature", joint.armature))
         simulated.dof_damping[j], simulated.dof_dampingpoly[j] = form.viscous, 0.0
-        simulated.dof_frictionloss[j] = 0.0 if j in bristles else form.coulomb
+        simulated.dof_frictionloss[j] = form.coulomb
     spec.copy_back(simulated)
     for motor, element in zip(machine.motors, list(spec.actuators), strict=True):
         element.name = motor.name
-    step = model.dt / math.ceil(model.dt / _longest_step(forms, bristles) - 1e-9)
+    longest = 5e-4  # time step of a written file at most [s]
+    step = model.dt / math.ceil(model.dt / longest - 1e-9)
     spec.option.timestep, spec.option.integrator = step, int(mujoco().mjtIntegrator.mjINT_RK4)
     pull = np.zeros((len(forms), 4))
     for j, (joint, form) in enumerate(zip(machine.joints, forms, strict=True)):
         stiffness = float(system.values.get(f"{joint.name}.stiffness", joint.stiffness))
         pull[j, :2] = stiffness * joint.rest + form.offset, -stiffness
     drives = {joint: Drive() for joint in system.joints}
-    file = OpenFile(spec, system, fitted.rig.measured, model.dt, step, mobility, pull, drives)
+    file = OpenFile(spec, system, fitted.rig.measured, model.dt, step, pull, drives)
     for motor in motors_of(fitted, system)[len(machine.motors) :]:
         acting_on(file, machine.joints[motor.joint].name, motor.name, motor.gear)
-    return file, bristles
+    return file
 
 
 def _bodies(simulated: Any, system: Tree) -> None:
@@ -186,32 +153,6 @@ def _bodies(simulated: Any, system: Tree) -> None:
             mujoco().mju_mat2Quat(simulated.body_iquat[i], axes.ravel())
 
 
-def _bristle(j: int, form: FrictionForm, model: StateSpaceModel, inertia: float) -> dict[int, Bristle]:
-    """Bristle of a joint by law or, a stiff one, where its friction dips: MuJoCo has a dip only there."""
-    if form.breakaway <= 0:
-        return {}
-    for effect in model.effects:
-        if isinstance(effect, PreslidingFriction) and effect.joint == j + 1:
-            return {j: (float(np.exp(effect.log_sigma)), max(float(effect.damping), 0.0))}
-    if form.breakaway <= form.coulomb:
-        return {}
-    soft = form.breakaway / (max(form.smooth, 0.01 * form.stribeck) * model.dt)
-    stiffness = min(soft, LARGEST_RELAXATION * _level(form) / (form.fastest * LONGEST_STEP))
-    return {j: (stiffness, float(np.sqrt(stiffness * inertia)))}
-
-
-def _longest_step(forms: Sequence[FrictionForm], bristles: Mapping[int, Bristle]) -> float:
-    """Longest time step that the bristles bear: one relaxes at stiffness |v| / level [s]."""
-    rates = [stiffness * forms[j].fastest / _level(forms[j]) for j, (stiffness, _) in bristles.items()]
-    shortest = 5e-5  # shortest time step of a written file [s]
-    return max(min([LONGEST_STEP, *(LARGEST_RELAXATION / rate for rate in rates)]), shortest)
-
-
-def _level(form: FrictionForm) -> float:
-    """Coulomb torque of a bristle, which may not vanish."""
-    return max(form.coulomb, 1e-2 * form.breakaway)
-
-
 def _springs(file: OpenFile) -> None:
     """Write the pull at every joint: stiffness about a rest, and a constant that has no rest as a passive motor."""
     for joint, (a, b, c, d) in zip(file.system.machine.joints, file.pull.tolist(), strict=True):
@@ -220,7 +161,14 @@ def _springs(file: OpenFile) -> None:
         element.stiffness, element.springref = slopes, rest if any((b, c, d)) else element.springref
         constant = a + rest * (b + rest * (c + rest * d))
         if abs(constant) > 1e-12 * abs(a):
-            passive(file, joint.name, "offset", cogging=(constant, 0.0, 0.5 * math.pi))
+            _constant(file, joint.name, constant)
+
+
+def _constant(file: OpenFile, joint: str, torque: float) -> None:
+    """A constant torque, which MuJoCo has as the cogging without poles of a motor without input; since MuJoCo 4.0."""
+    motor, quarter = acting_on(file, joint, f"{joint}_offset", 1.0), 0.5 * math.pi
+    none = int(mujoco().mjtCtrlInput.mjINPUT_NONE)
+    motor.set_to_dcmotor(motorconst=[0.0, 0.0], resistance=1.0, ctrlspec=none, cogging=(torque, 0.0, quarter))
 
 
 def _rest(a: float, b: float, c: float, d: float) -> float:
@@ -238,12 +186,9 @@ def _noise(file: OpenFile, noise: Float[np.ndarray, " obs"]) -> None:
 
 def _motor(file: OpenFile, motor: Motor, element: Any) -> None:
     """The way from a control to a force; the state of a lag is held over a step, half a step late."""
-    joint, unit = file.system.machine.joints[motor.joint], abs(motor.unit)
-    drive = file.drives.get(motor.joint + 1, Drive())
+    unit, drive = abs(motor.unit), file.drives.get(motor.joint + 1, Drive())
     if motor.kind != TORQUE:
         element.set_to_motor()
-    if file.spec.joint(rotor(joint.name)) is not None:
-        element.target = rotor(joint.name)
     if math.isfinite(drive.before):
         element.ctrllimited, element.ctrlrange = True, [-drive.before / unit, drive.before / unit]
     if math.isfinite(drive.after):

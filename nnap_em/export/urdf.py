@@ -14,7 +14,6 @@ from ..storage.files import replace_own
 from ..systems.tree import Tree
 from .friction import REPORTED_MISS, FrictionForm, friction_forms
 from .mjcf import as_it_is, named
-from .placement import MASSLESS
 
 NO_LIMIT = 1e9
 """Limit of a slide without stops, of an effort or a rate without limit: URDF requires one."""
@@ -100,7 +99,8 @@ def _body(root: ET.Element, system: Tree, laws: list, i: int, parent: str, pose:
         ET.SubElement(element, "dynamics", damping=_text(viscous), friction=_text(dry))
         parent, pose = link, np.linalg.inv(anchor)
         if not last:
-            _inertial(ET.SubElement(root, "link", name=link), MASSLESS, np.zeros(3), MASSLESS * np.eye(3))
+            nearly_none = 1e-12  # mass and inertia of a link between two joints of one body [kg, kg m^2]
+            _inertial(ET.SubElement(root, "link", name=link), nearly_none, np.zeros(3), nearly_none * np.eye(3))
     if not joints:
         element = ET.SubElement(root, "joint", name=f"{body.name}_mount", type="fixed")
         _origin(element, pose)

@@ -41,9 +41,6 @@ POSES = 256
 """Rows of the logs, evenly over them, in which the loads of joints are taken."""
 RECORDED = 10.0
 """Length of a recording in slowest time constants."""
-REVERSALS = 20
-"""Changes of direction below which logs hardly show memory: a contact has ten numbers, and a reversal shows two, the
-distance over which friction turns and its size."""
 SAME_HOLD = 0.25
 """Distance to the lag of the other hold, half a row, within which that is meant [rows]: half way."""
 _LONG = 20.0, 500  # s and rows of a sequence from which on it is better cut: a hidden joint is lost later on
@@ -124,7 +121,6 @@ def check(
         *torques(rig, system, data, scales),
         *dynamics(rig, system, data),
         *_motion(rig, model, data, along),
-        *(memory(rig, model, data, along, scales) if rig.memory else ()),
         *_observability(model, along, np.asarray(head.valid)),
     ]
 
@@ -467,36 +463,6 @@ def _motion(rig: Rig, model: StateSpaceModel, data: Dataset, along: Along) -> It
         ]
         remarks = [hint for holds, hint in hints if holds]
         yield CheckResult(_mark(remarks and rig.friction), "motion", "; ".join([text, *remarks]))
-
-
-def memory(rig: Rig, model: StateSpaceModel, data: Dataset, along: Along, scales: Scales) -> Iterator[CheckResult]:
-    """Reversals, and the shortest presliding distance that the samples and readings resolve, of every joint."""
-    system = model.system
-    for joint, name in enumerate(system.coordinates):
-        v, hidden = _velocity(rig, model, data, along, joint)
-        if not np.isfinite(v).any():
-            continue
-        q = np.asarray(data.y)[..., rig.measured.index(name)] if name in rig.measured else along.x[..., joint]
-        low, high = np.nanpercentile(q, [1, 99])
-        top = float(np.nanpercentile(np.abs(v), 99))
-        turns = int(sum(_turns(row, 0.02 * top) for row in v))
-        travel = 2 * float(scales.acceleration[joint]) * rig.dt**2
-        noise = rig.noise_std.get(name, 0.0)
-        least, unit = max(travel, noise), system.unit(name)
-        cause = "the noise of its reading" if noise > travel else "its travel over two samples after a reversal"
-        text = (
-            f"joint {joint + 1}{hidden}: {turns} reversals; a presliding distance below {least:.2g} {unit}, {cause}, "
-        )
-        text += "looks like a static map"
-        hints = [
-            (
-                turns < REVERSALS,
-                f"fewer than {REVERSALS} reversals: move it to and fro, slowly and with small amplitudes",
-            ),
-            (least > 0.1 * (high - low), "that is more than a tenth of its range: sample faster, or move more gently"),
-        ]
-        remarks = [hint for holds, hint in hints if holds]
-        yield CheckResult(_mark(remarks), "memory", "; ".join([text, *remarks]))
 
 
 def _velocity(

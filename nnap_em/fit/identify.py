@@ -65,8 +65,6 @@ class Identified(NamedTuple):
     """Smoother of the fit and of all that uses it: prediction, residuals and the search for missing effects."""
     discrepancy: float = 0.0
     """Size of the forces that no part of the model describes (`stated.widened`); 0 where likelihood is efficient."""
-    memory: str = ""
-    """Result of the search for memory of friction, a line per joint; empty where the rig declares a static map."""
     horizon_note: str | None = None
     """Sentence on fits by likelihood and by errors over the horizon of use; of equations alone."""
     rise: float = 0.0
@@ -95,7 +93,7 @@ class Identified(NamedTuple):
         lines = [f"Identified {self.rig.name!r} after {counted(self.state.epoch, 'epoch')}{stop}"]
         lines += [f"estimated: {quantities(estimated, self.rig.unit)}"] if estimated else []
         lines += [self.misfit.text] * bool(self.misfit.text)
-        return "\n  ".join([*lines, *self.memory.splitlines(), str(self.model)])
+        return "\n  ".join([*lines, str(self.model)])
 
 
 class FrictionTable(NamedTuple):
@@ -152,7 +150,33 @@ def identify(
     start: Identified | None = None,
     watch: Watch = unwatched,
 ) -> Identified:
-    """Fit the declared unknowns of a rig to logs by EM, friction as a static map: `nnap_em.identify` without memory."""
+    """Fit the declared unknowns of a rig to logs by Expectation-Maximisation: friction, uncertain parameters, noise.
+
+    [Vantilborgh, Lefebvre & Crevecoeur, the paper that this library implements, algorithm 1]
+
+    Args:
+        rig: what is declared.
+        data: sequences to fit.
+        key: random key of the start.
+        smoother: makes the smoother, such as `nnap_em.smoothers.ParticleSmoother`; without it that of `start`, or the
+            cubature smoother.
+        epochs: of EM, at most.
+        schedule: the growing horizon.
+        start: a fit to go on from.
+        watch: called after every epoch with its state, the rows seen and the sequences used.
+
+    Returns:
+        The fitted model with what is needed to use it, to judge it and to go on; `print` shows a table.
+
+    Raises:
+        DataError: arrays are not of the rig: other columns, another interval, a row without an input.
+        FitError: no sequence can be followed.
+
+    Example:
+        >>> fit = nnap_em.identify(rig, train, key=key, epochs=3)
+        >>> fit.model.log_r.shape  # one measured column
+        (1,)
+    """
     logs = logs_of_arrays(data, rig)
     data = stepped(sequences_of(logs, rig))
     if rig.equations and (infinite := infinite_rates(rig, build_system(rig), logs)):
@@ -277,8 +301,6 @@ def nodes_between(
 def friction_table(fitted: Identified, velocity: Float[Array, "dof node"]) -> FrictionTable:
     """Friction in steady sliding, and its covariance (Laplace).
 
-    It is the learned map; with `friction = "dynamic"` at the lowest velocities that of the contact with memory.
-
     Args:
         fitted: the model.
         velocity: rates of each joint (joint, node) [rad/s, or m/s]; of one joint `v[None]`.
@@ -293,30 +315,18 @@ def friction_table(fitted: Identified, velocity: Float[Array, "dof node"]) -> Fr
     weights = fitted.m_step.weights(fitted.model)
     w, model = weights.read(fitted.model), fitted.model
     units = tuple((model.system.unit(rate), model.system.force_unit(j)) for j, rate in enumerate(model.system.rates, 1))
-    contacts = model if fitted.rig.memory else None
-    return FrictionTable(
-        velocity, *_friction(weights, model.unknown, w, fitted.state.hessian, velocity, contacts), units
-    )
+    return FrictionTable(velocity, *_friction(weights, model.unknown, w, fitted.state.hessian, velocity), units)
 
 
 @eqx.filter_jit
-def _friction(weights: Weights, unknown, w, precision, velocity, contacts: StateSpaceModel | None):
-    """Torque at `velocity`, and its covariance: that of the nodes beside it; with the effects of `contacts`."""
+def _friction(weights: Weights, unknown, w, precision, velocity):
+    """Torque at `velocity`, and its covariance: that of the nodes beside it."""
     torque = jax.vmap(unknown.with_weights(w[: w.shape[0] - weights.prior.size]))(velocity.T).T
-    dof, count = weights.nodes.shape
+    count = weights.nodes.shape[1]
     between = jax.vmap(lambda nodes, v: jax.vmap(lambda e: jnp.interp(v, nodes, e))(jnp.eye(count, dtype=v.dtype)).T)
     jac = jnp.zeros((*velocity.shape, precision.shape[0]), velocity.dtype)
     for j, share in enumerate(between(weights.nodes, velocity)):
         jac = jac.at[j, :, j * count : (j + 1) * count].set(share)
-    if contacts is not None and contacts.effects:
-        parameters = slice(dof * count, None)
-
-        def sliding(z):
-            effects = weights.prior.write(contacts, z).effects
-            return jax.vmap(lambda v: sum((e.sliding(v) for e in effects), jnp.zeros_like(v)))(velocity.T).T
-
-        z = w[w.shape[0] - weights.prior.size :]
-        torque, jac = torque + sliding(z), jac.at[..., parameters].add(jax.jacfwd(sliding)(z))
     half = jax.scipy.linalg.solve_triangular(
         jnp.linalg.cholesky(precision), jac.reshape(-1, jac.shape[-1]).T, lower=True
     )

@@ -20,7 +20,6 @@ from ..data.dataset import Dataset
 from ..data.limits import Bounds
 from ..data.rig import Declared, Rig
 from ..effects import catalogue, parts
-from ..model.dynamic_friction import DynamicFriction
 from ..numerics.digest import plain
 from ..smoother import kinds
 from ..storage.files import Kind, read_arrays, refuse, write_arrays
@@ -181,7 +180,7 @@ def _assemble(path: Path, header: Mapping[str, Any], arrays: Mapping[str, np.nda
             differs(place, "of another shape" if array is not None else "no array in the file")
         return restore(leaves[place], array, value)
 
-    known = {kind.__name__: kind for kind in (*catalogue.values(), *parts, DynamicFriction)}
+    known = {kind.__name__: kind for kind in (*catalogue.values(), *parts)}
     effects = tuple(_drawn(path, sketch, "effect", known) for sketch in header["effects"])
     tree = _tree(begin(rig, _blank(rig), key=jax.random.key(0), effects=effects))
     tree["smoother"] = _drawn(path, header["smoother"], "smoother", kinds)

@@ -23,7 +23,6 @@ from ..numerics.digits import counted
 from ..numerics.profile import stage
 from ..storage.files import replace_bytes
 from ..storage.log import Log
-from .contacts import contacts, hysteresis_figure
 from .document import errors, friction_law, noise, parameters, predictions, shared, unknown_terms, visited
 from .fit_plots import error_figure, friction_figure, term_figure
 from .page import Picture, picture, write_page
@@ -57,10 +56,6 @@ def write_identification(
         laws = friction_law(fitted, table, velocities)
         write_friction(out / "friction.csv", *map(np.asarray, (table.velocity, table.torque, table.std)))
         figures.append(_draw(out / "friction.png", fitted, table, velocities))
-    bristles = contacts(fitted) if fitted.rig.memory else []
-    if bristles:
-        caption = "Slow cycles as wide as the presliding distance on either side, with their 90 % band."
-        figures.append(picture("found", "Presliding", caption, hysteresis_figure(bristles, names)))
     terms = unknown_terms(fitted)
     caption = (
         "Over the range of its signals in a simulation; the parameters of the equations have all that they can do."
@@ -88,9 +83,7 @@ def write_identification(
         "stopped": _stopped_early(fitted),
         "horizon_note": fitted.horizon_note,
         "friction_law": laws,
-        "friction_memory": [*fitted.memory.splitlines(), *(bristle.text for bristle in bristles)],
         "unknown": terms,
-        "contacts": [bristle.document() for bristle in bristles],
         "log_likelihood": fitted.state.loglik.tolist(),
         "reached": float(np.nanmean(fitted.state.top)),
         "epochs": entries,
@@ -136,8 +129,6 @@ def _log_summary(document: dict[str, Any], log: Log) -> None:
         log(document["verdict"])
     for law in document["friction_law"] or []:
         log(law["text"])
-    for text in document["friction_memory"]:
-        log(text)
     if document["stopped"]:
         log(document["stopped"])
     if document["horizon_note"]:

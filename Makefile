@@ -1,4 +1,4 @@
-# make demo | make test | make docs: all the set-up there is. Another interpreter: make PYTHON=python3.12 test
+# make demo | make test | make test-slow | make docs: all the set-up there is. Another interpreter: make PYTHON=python3.12 test
 PYTHON ?= python3
 # A worker takes whole files, so that what a file sets up is made once; tests/costs.py has the order.
 PYTEST_FLAGS ?= -n 2 --dist loadfile --no-loadscope-reorder --durations 20
@@ -14,25 +14,27 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --constr
 # Lint and documentation side by side.
 MAKEFLAGS += --jobs=2
 
-.PHONY: demo test check lint docs gallery notebook matrix clean
+.PHONY: demo test test-slow check lint docs gallery notebook matrix clean
 
 demo: .venv/.demo
 	$(BIN)/python examples/acrobot_em.py
 
 test: lint docs
-	$(BIN)/pytest $(PYTEST_FLAGS)
+	$(BIN)/pytest $(PYTEST_FLAGS) -m "not slow"
+
+# Long fits, many seeds, kill and resume of real searches. SLOW="tests/test_design.py ...": those files alone.
+test-slow: .venv/.test
+	$(BIN)/pytest $(PYTEST_FLAGS) -m slow $(SLOW)
 
 # Before each commit: lint, types and the tests that compile no large program.
 check: .venv/.test
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
-	$(BIN)/python tests/prose.py
 	$(BIN)/pyright & types=$$!; $(BIN)/pytest $(PYTEST_FLAGS) --durations 3 -m "not slow and not large" && wait $$types
 
 lint: .venv/.test
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
-	$(BIN)/python tests/prose.py
 	$(BIN)/pyright
 
 docs: .venv/.test

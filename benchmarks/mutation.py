@@ -1,4 +1,4 @@
-"""Every place of `tests/mutants.py` broken in turn: the list of docs/results/mutants.csv.
+"""Every place of `mutants.py` broken in turn: the list of docs/results/mutants.csv.
 
 python benchmarks/mutation.py [--share 1/1]
 """

@@ -40,7 +40,6 @@ SECONDS = {
     "test_blackbox.py": 29,
     "test_traced.py": 27,
     "test_predict.py": 25,
-    "test_mutants.py": 25,
     "test_export.py": 23,
     "test_plant.py": 20,
     "test_tour.py": 60,

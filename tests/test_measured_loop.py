@@ -2,7 +2,6 @@
 
 import measured_loop
 import numpy as np
-import plant
 import pytest
 import recordings
 from measured_figures import MissingTorque, errors_figure, finding_figure
@@ -57,11 +56,6 @@ def test_the_import_keeps_the_law_as_its_mean_over_each_step(source, tmp_path):
     assert data["recorded"].y.shape == (1, 500, 2)
 
 
-def test_laws_of_the_page_are_laws_of_the_plant():
-    assert set(measured_loop.LAWS) == set(measured_loop.STRENGTH) <= set(plant.JOINT)
-    assert all(measured_loop.STRENGTH[law][0] in numbers for law, numbers in measured_loop.LAWS.items())
-
-
 def _diagnosed(folder, effects):
     for part, count in (("train", 6), ("test", 2)):
         (folder / part).mkdir(parents=True, exist_ok=True)
@@ -70,14 +64,13 @@ def _diagnosed(folder, effects):
     return measured_loop.Diagnosis(folder, {"effects": effects}, None, None)  # type: ignore[arg-type]
 
 
-def test_the_table_has_eight_lines(tmp_path):
+def test_the_table_says_what_was_found(tmp_path):
     number = {"value": 0.6012, "std": 0.0123, "unit": "N m/rad"}
     spring = {"name": "torsional_spring", "joint": 2, "parameters": {"k": number}, "description": "spring at 2: k"}
     spring["evidence"] = {"share_of_error": 0.7}
     recorded, planted = (_diagnosed(tmp_path, effects) for effects in ([], [spring]))
     off = {"before": 0.5, "after": 0.25, "recorded": 0.24}
     lines = dict(measured_loop.lines(recorded, planted, "torsional_spring", off))
-    assert len(lines) == 8
     assert list(lines.values())[:2] == ["6 to fit, 2 to test", "nothing"]
     assert "0.6 N m/rad" in lines.values() and "0.601 ± 0.01 N m/rad" in lines.values()
     assert [value for value in lines.values() if value.endswith(" rad")] == ["0.500 rad", "0.250 rad", "0.240 rad"]
@@ -104,8 +97,3 @@ def test_a_folder_without_the_files_is_refused_in_one_sentence(tmp_path, monkeyp
     assert measured_loop.main() == 1
     said = capsys.readouterr().err
     assert said.startswith("error: ") and "experiment01.csv: not there" in said and said.count("\n") == 1
-
-
-def test_the_page_names_the_declaration():
-    page = measured_loop.RIG.parents[2] / "docs" / "real_machine.md"
-    assert f"examples/machines/{measured_loop.RIG.name}" in page.read_text()

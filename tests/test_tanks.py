@@ -72,12 +72,6 @@ def test_a_file_with_other_columns_is_refused(tmp_path):
         tanks.recordings(tmp_path)
 
 
-def test_the_page_has_the_declaration_of_the_example():
-    page = (tanks.RIG.parents[2] / "docs" / "equations.md").read_text()
-    declared = re.search(r"```toml\n(format.*?)```", page, re.DOTALL)
-    assert declared and tanks.RIG.read_text().endswith(declared[1])
-
-
 def test_the_error_is_that_after_the_first_fifty_readings():
     t = 4.0 * np.arange(100)
     side = tanks.Simulation(t, np.where(t <= 196, 9.0, 1.0), np.full(100, 1.5))

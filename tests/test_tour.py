@@ -22,13 +22,6 @@ def _cells():
     return [("markdown" if part.startswith(" [markdown]\n") else "code", part.partition("\n")[2]) for part in parts]
 
 
-def test_it_is_short_and_told():
-    cells = _cells()
-    assert 15 <= len(cells) <= 20
-    assert all(line.startswith("#") for kind, text in cells if kind == "markdown" for line in text.split("\n") if line)
-    assert TOUR.read_text().startswith("# ---\n# jupyter:\n")
-
-
 @pytest.mark.slow
 def test_it_runs_and_finds_the_cable(tmp_path, monkeypatch, capsys):
     """The truth is 30 N/m; the stated standard deviation holds it."""

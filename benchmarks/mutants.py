@@ -1,6 +1,6 @@
 """Places of the core broken on purpose, each with the test that must turn red.
 
-`tests/test_mutants.py` runs some of them, `benchmarks/mutation.py` all.
+`mutation.py` runs them.
 """
 
 import shutil

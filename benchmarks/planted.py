@@ -2,10 +2,11 @@
 
     python benchmarks/planted.py list
     python benchmarks/planted.py make dfki_c1-spring2-strong --out out/case
-    python benchmarks/planted.py run --out out/planted [--split look] [--share 1/2] ['dfki_c1-*' ...]
+    python benchmarks/planted.py run --out out/planted [--split look] ['dfki_c1-*' ...]
     python benchmarks/planted.py table out/planted [--out docs/results/planted_table.md]
 
-`run` leaves one JSON file a case, with truth and report; a case that has one is not run again.
+`run` takes a case at a time on every core, and leaves one JSON file a case, with truth and report; a case that has one
+is not run again.
 
 How a log is changed: planted_make.py; the laws and the list: planted_cases.py; the scores: planted_table.py.
 """
@@ -14,15 +15,18 @@ import argparse
 import fnmatch
 import json
 import os
-import resource
+import queue
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 import tomllib
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from planted_cases import CASES, split
 from planted_make import ROOT, make
 from planted_table import cases, score, table
@@ -31,8 +35,10 @@ from nnap_em.commands.common import MISFIT_STATUS
 from nnap_em.storage.files import replace_text
 
 
-def run(name: str, out: Path, limit: float) -> dict[str, Any]:
-    """`nnap-em diagnose` on a case in a process of its own, ended after `limit` [s]; writes and returns the record."""
+def run(name: str, out: Path, limit: float, core: int) -> dict[str, Any]:
+    """`nnap-em diagnose` on a case in a process of its own on one core, ended after `limit` [s]; writes and returns the
+    record.
+    """
     with tempfile.TemporaryDirectory() as folder:
         case, result = Path(folder, "case"), Path(folder, "found")
         record: dict[str, Any] = {"case": name, "truth": make(name, case), "code": _commit()}
@@ -40,35 +46,28 @@ def run(name: str, out: Path, limit: float) -> dict[str, Any]:
             sum(1 for _ in path.open()) * tomllib.loads((case / "rig.toml").read_text())["sampling"]["dt"]
             for path in case.glob("train/*.csv")
         )
-        environment = os.environ | {"JAX_NUM_CPU_DEVICES": "1", "PYTHONPATH": str(ROOT)}
+        alone = {"JAX_NUM_CPU_DEVICES": "1", "OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
         command = [sys.executable, "-m", "nnap_em.commands.cli", "diagnose", str(case), "--out", str(result), "--quiet"]
-        began, spent = time.perf_counter(), _processor()
+        began = time.perf_counter()
         with Path(folder, "said").open("w+") as said:
-            process = subprocess.Popen(command, env=environment, stdout=said, stderr=said)
-            try:
-                status = process.wait(limit)
-            except subprocess.TimeoutExpired:
-                status = f"not done after {limit:.0f} s"
-            finally:
-                process.kill()
-                process.wait()
+            process = subprocess.Popen(command, env=os.environ | alone, stdout=said, stderr=said)
+            os.sched_setaffinity(process.pid, {core})
+            (end := threading.Timer(limit, process.kill)).start()
+            _, status, used = os.wait4(process.pid, 0)
+            end.cancel()
             said.seek(0)
             last = (said.read().strip().splitlines() or [""])[-1]
         record["seconds"] = time.perf_counter() - began
-        record["processor_seconds"] = _processor() - spent
+        record["processor_seconds"] = used.ru_utime + used.ru_stime
+        status = os.waitstatus_to_exitcode(status)
         if status in (0, MISFIT_STATUS):
             record["report"] = json.loads((result / "report.json").read_text())
         else:
-            record["failed"] = status if isinstance(status, str) else f"status {status}: {last}"
+            ended = record["seconds"] >= limit
+            record["failed"] = f"not done after {limit:.0f} s" if ended else f"status {status}: {last}"
     out.mkdir(parents=True, exist_ok=True)
     replace_text(out / f"{name}.json", json.dumps(record))
     return record
-
-
-def _processor() -> float:
-    """Processor time of all processes that ended [s]: the clock tells little on a machine that is busy."""
-    used = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return used.ru_utime + used.ru_stime
 
 
 def _commit() -> str:
@@ -82,12 +81,34 @@ def records(folder: Path) -> list[dict[str, Any]]:
     return [json.loads(path.read_text()) for path in sorted(folder.glob("*.json"))]
 
 
-def _chosen(patterns: list[str], part: str, share: str) -> list[str]:
+def _chosen(patterns: list[str], part: str) -> list[str]:
     """Names of the list that match, and names outside the list as they are."""
-    first, step = map(int, share.split("/"))
     names = [n for n in CASES if part in ("all", split(n)) and any(fnmatch.fnmatch(n, p) for p in patterns)]
-    names += [p for p in patterns if p not in CASES and not set("*?[") & set(p)]
-    return names[first % step :: step]
+    return names + [p for p in patterns if p not in CASES and not set("*?[") & set(p)]
+
+
+def _run_all(names: list[str], out: Path, limit: float) -> None:
+    """A case at a time on every core; the last line has the time of all."""
+    began, spent, cores = time.perf_counter(), [], queue.SimpleQueue()
+    for core in os.sched_getaffinity(0):
+        cores.put(core)
+
+    def one(name: str) -> None:
+        core = cores.get()
+        try:
+            record = run(name, out, limit, core)
+        finally:
+            cores.put(core)
+        done = score(record, {})
+        spent.append(record["processor_seconds"])
+        print(f"{name}: {done.named} of {done.truths}, {done.extras} extra; {done.effects}", flush=True)
+
+    with ThreadPoolExecutor(cores.qsize()) as pool:
+        list(pool.map(one, names))
+    print(
+        f"{len(spent)} cases in {time.perf_counter() - began:.0f} s on {cores.qsize()} cores, a median of "
+        f"{np.median(spent or [0]):.0f} s of a processor a case"
+    )
 
 
 def main() -> None:
@@ -102,7 +123,6 @@ def main() -> None:
     running.add_argument("cases", nargs="*", default=["*"], help="names or patterns; all, if none is given")
     running.add_argument("--out", type=Path, required=True)
     running.add_argument("--split", default="all", choices=("look", "kept", "all"))
-    running.add_argument("--share", default="0/1", help="i/n: every n-th case from the i-th, for several processes")
     running.add_argument("--limit", type=float, default=1200.0, help="seconds for a case (1200)")
     writing = commands.add_parser("table", help="what the records say: sums as Markdown, every case as CSV beside it")
     writing.add_argument("folder", type=Path)
@@ -121,10 +141,8 @@ def _do(args: argparse.Namespace) -> None:
         for effect in make(args.case, args.out)["effects"]:
             print(effect)
     if args.command == "run":
-        for name in _chosen(args.cases or ["*"], args.split, args.share):
-            if not (args.out / f"{name}.json").exists():
-                done = score(run(name, args.out, args.limit), {})
-                print(f"{name}: {done.named} of {done.truths}, {done.extras} extra; {done.effects}", flush=True)
+        names = [n for n in _chosen(args.cases or ["*"], args.split) if not (args.out / f"{n}.json").exists()]
+        _run_all(names, args.out, args.limit)
     if args.command == "table":
         every = records(args.folder)
         print(table(every)) if args.out is None else replace_text(args.out, table(every))

@@ -210,6 +210,21 @@ FOREIGN = {
 }
 
 
+def test_a_file_of_a_version_with_more_in_it_is_read_where_that_was_empty(file):
+    """Friction could have memory: fits without any are as they were, and one with it is refused."""
+    bits = _bits(load(file))
+
+    def older(header, arrays):
+        header["rig"]["memory"] = False
+        header["leaves"]["/memory"] = {"is": "plain", "of": ""}
+
+    _rewrite(file, older)
+    assert _bits(load(file)) == bits
+    _rewrite(file, lambda header, arrays: header["rig"].update(memory=True))
+    with pytest.raises(StoreError, match="identify again"):
+        load(file)
+
+
 @pytest.mark.parametrize("make, reason", FOREIGN.values(), ids=FOREIGN)
 def test_a_foreign_file_is_refused(tmp_path, make, reason):
     path = tmp_path / "foreign.npz"

@@ -81,23 +81,20 @@ def parameters(fitted: Identified) -> dict[str, Any]:
 def unrolled(
     name: str,
     function: Callable[..., tuple[Array, ...]],
-    truth: Callable[..., tuple[Array, ...]] | None = None,
-    names: dict[str, Any] | None = None,
     **arguments: Array,
 ) -> Source:
     """`function` in NumPy, compared with JAX at four random places about `arguments`.
 
-    The numbers of JAX are those of `truth`, where the function has others by their `names` in it.
     Raises ExportError where there is no such source, or where its numbers are others.
     """
     try:
         source = unroll(name, function, **arguments)
     except UnrollError as error:
         raise ExportError(str(error)) from None
-    rng, space = np.random.default_rng(0), {"np": np, **(names or {})}
+    rng, space = np.random.default_rng(0), {"np": np}
     centres = [np.asarray(a) for a in arguments.values()]
     places = [np.where(a == 0, 3.0, 0.1 * a) * rng.normal(size=(4, *a.shape)) + a for a in centres]
-    expected = jax.jit(jax.vmap(truth or function))(*(jnp.asarray(a, jnp.result_type(float)) for a in places))
+    expected = jax.jit(jax.vmap(function))(*(jnp.asarray(a, jnp.result_type(float)) for a in places))
     exec(str(source), space)  # what the exported program does
     with np.errstate(all="ignore"):
         outputs = cast(Callable, space[name])(*(tuple(a.reshape(4, -1).T) for a in places))
@@ -127,13 +124,6 @@ def states_of(model: StateSpaceModel) -> tuple[str, ...]:
     return names + tuple(f"memory{i + 1}" for i in range(model.log_q.shape[0] - len(names)))
 
 
-def literal(value: Any) -> str:
-    """A number, text, tuple or array as Python source."""
-    if isinstance(value, jax.Array | np.ndarray):
-        return f"np.array({np.asarray(value).tolist()!r}).reshape({np.shape(value)!r})".replace("inf", "np.inf")
-    return repr(value)
-
-
 def _pairs(names: tuple[str, ...], values: np.ndarray) -> dict[str, float]:
     return dict(zip(names, values.tolist(), strict=True))
 
@@ -153,7 +143,6 @@ def _friction(fitted: Identified) -> dict[str, Any]:
         "network": {
             "form": "scale * mlp(v / speed, asinh(v / knee) / asinh(speed / knee)), tanh layers, one network per joint",
             **{name: np.asarray(getattr(unknown, name)).tolist() for name in ("speed", "knee", "scale")},
-            **({} if unknown.rest is None else {"straight_below": np.asarray(unknown.rest).tolist()}),
             "layers": [
                 {"weight": np.asarray(layer.weight).tolist(), "bias": np.asarray(layer.bias).tolist()}
                 for layer in unknown.mlp.layers

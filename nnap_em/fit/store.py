@@ -185,8 +185,8 @@ def _assemble(path: Path, header: Mapping[str, Any], arrays: Mapping[str, np.nda
     tree = _tree(begin(rig, _blank(rig), key=jax.random.key(0), effects=effects))
     tree["smoother"] = _drawn(path, header["smoother"], "smoother", kinds)
     tree = walk(tree, leaf)
-    for place in leaves:
-        if place not in seen:
+    for place, entry in leaves.items():
+        if place not in seen and entry.get("of", entry):  # what is gone and was empty changes nothing
             differs(place, "unknown here")
     return Identified(rig=rig, **tree)
 
@@ -225,6 +225,8 @@ def _rig(entries: Mapping[str, Any]) -> Rig:
     values: dict[str, Any] = {
         name: tuple(value) if isinstance(value, list) else value for name, value in entries.items()
     }
+    if not values.get("memory"):  # of a version whose friction could have one
+        values.pop("memory", None)
     values["parameters"], values["start"] = declared(entries["parameters"]), declared(entries["start"])
     pairs = {part: {name: tuple(pair) for name, pair in table.items()} for part, table in entries["limits"].items()}
     values["limits"] = Bounds(**pairs)

@@ -59,8 +59,6 @@ class FrictionNetwork(AbstractJointMap):
     """Velocity below which the map is resolved linearly [rad/s]."""
     scale: Float[Array, " dof"]
     """Torque of a unit output [N m]."""
-    rest: Float[Array, " dof"] | None
-    """Velocity up to which a joint's map is a straight line [rad/s]: what is below is a contact's; None: nowhere."""
 
     def __init__(
         self,
@@ -76,7 +74,6 @@ class FrictionNetwork(AbstractJointMap):
         self.speed = speed
         self.knee = speed / resolution
         self.scale = scale
-        self.rest = None
 
     def __str__(self) -> str:
         speeds = ", ".join(f"{float(v):.3g}" for v in self.speed)
@@ -84,30 +81,18 @@ class FrictionNetwork(AbstractJointMap):
 
     def torque(self, v: Float[Array, " dof"], through: Callable = _together) -> Float[Array, " dof"]:
         """Friction torque at joint velocities [N m], `through` the networks of all joints."""
-        if self.rest is None:
-            return self._network(v, through)
-        edge = jnp.where(self.rest > 0, self.rest, 1.0)
-        high, low = self._network(edge, through), self._network(-edge, through)
-        line = 0.5 * (high + low) + 0.5 * (high - low) * v / edge
-        return jnp.where(jnp.abs(v) < self.rest, line, self._network(v, through))
+        top = asinh(self.speed / self.knee)
+        return self.scale * through(self.mlp, jnp.stack([v / self.speed, asinh(v / self.knee) / top], axis=-1))
 
     def by_entry(self) -> "FixedFriction":
         """This map in scalars, which fuse: for one state each product of a layer is a program of its own."""
         return FixedFriction(lambda v: self.torque(v, _in_scalars), self.scale)
-
-    def _network(self, v: Float[Array, " dof"], through: Callable) -> Float[Array, " dof"]:
-        top = asinh(self.speed / self.knee)
-        return self.scale * through(self.mlp, jnp.stack([v / self.speed, asinh(v / self.knee) / top], axis=-1))
 
     @eqx.filter_jit
     def nodes(self, count: int) -> Float[Array, "dof count"]:
         """Velocities [rad/s], dense near rest, at which the map is tabulated in the M-step."""
         top = jnp.arcsinh(self.speed / self.knee)
         line = jnp.linspace(-1.0, 1.0, count, dtype=self.speed.dtype)[None, :]
-        if self.rest is not None:  # none within the straight line but its middle
-            first, gap = (jnp.arcsinh(self.rest / self.knee) / top)[:, None], 2 / (count - 1)
-            away = first + (1 - first) * (jnp.abs(line) - gap) / (1 - gap)
-            line = jnp.where((jnp.abs(line) > 0.5 * gap) & (first > 0), jnp.sign(line) * away, line)
         return self.knee[:, None] * jnp.sinh(top[:, None] * line)
 
     @eqx.filter_jit

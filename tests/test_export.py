@@ -100,7 +100,7 @@ def test_a_slide_is_exported_in_newtons_and_metres():
 
 def test_a_form_with_other_numbers_is_not_exported(monkeypatch, tmp_path):
     monkeypatch.setitem(unroll._ELEMENTWISE, "tanh", "{}")
-    with pytest.raises(ExportError, match="the NumPy form of 'rate' gives other numbers than JAX"):
+    with pytest.raises(ExportError, match="the NumPy form of 'friction1_network' gives other numbers than JAX"):
         write_observer(_case(()).fitted, tmp_path / "arm.c")
     assert not list(tmp_path.iterdir())
 

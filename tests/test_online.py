@@ -16,7 +16,7 @@ from nnap_em.data.rig import Declared, Rig
 from nnap_em.effects import catalogue
 from nnap_em.export import online
 from nnap_em.export.model import ExportError
-from nnap_em.export.online import numbers, write_observer
+from nnap_em.export.online import numbers, table, write_observer
 from nnap_em.fit.identify import begin
 from nnap_em.fit.observer import AMBIGUOUS, MISSING, OUTLIER, RESTARTED, observer
 from nnap_em.fit.store import save
@@ -90,6 +90,7 @@ def test_c_gives_the_numbers_of_python_over_10000_rows_with_gaps(plain):
     flags = np.asarray(states.flags)
     assert np.any(flags & MISSING) and np.any(flags & OUTLIER)
     assert np.ptp(states.mean[5000:, 0]) > 1.0
+    assert "friction1_rows" in source.read_text()  # as a table, not as its network
 
 
 @pytest.mark.parametrize("laws", LAWS)
@@ -181,6 +182,15 @@ def test_smooth_inputs_go_straight_over_rows_that_never_came(plain, tmp_path):
     np.testing.assert_allclose(
         play(tmp_path / "smooth.c", t[gone], u[gone], y[gone], 2).mean[50:], whole.mean[52:], rtol=1e-12
     )
+
+
+def test_a_table_is_as_exact_as_it_says():
+    curve = lambda v: jnp.tanh(3 * v) + 0.1 * v  # noqa: E731
+    found = table(curve, "f", 2.0, 0.01, 1e-11)
+    assert found is not None
+    v = np.concatenate([np.linspace(-11.9, 11.9, 5001), np.linspace(-0.03, 0.03, 1001)])  # to six times the rate
+    np.testing.assert_allclose(found(v), curve(jnp.asarray(v)), rtol=0, atol=3e-11)
+    assert table(lambda v: jnp.sign(v - 0.1), "f", 2.0, 0.01, 1e-11) is None
 
 
 def test_nothing_is_written_where_a_law_has_no_c_form(tmp_path, monkeypatch):

@@ -164,7 +164,7 @@ PLAIN = Dialect()
 def function(source: Source, dialect: Dialect = PLAIN, out: str = "tau", points: str = "") -> str:
     """A C function of arrays, whose last argument `out` is the result.
 
-    With `points` of them the first argument and the result have an axis more.
+    With `points` of them the first argument and the result have an axis more; curves are read before the loop over it.
     """
     results, real = [text for result in source.results for text in result], dialect.real
     along, at, own = (f"[{points}]", "[l]", "restrict ") if points else ("", "", "")
@@ -180,6 +180,10 @@ def function(source: Source, dialect: Dialect = PLAIN, out: str = "tau", points:
     whole_numbers: set[str] = set()
     for line in source.lines:
         name, _, text = line.partition(" = ")
+        if points and (call := re.fullmatch(rf"(\w+)\({first}(\d+)\)", text)):
+            lines += [f"    {real} {name}s{along};", f"    {loop} {name}s{at} = {call[1]}({first}[{call[2]}]{at});"]
+            inside.append(f"    const {real} {name} = {name}s{at};")
+            continue
         node = ast.parse(text, mode="eval").body
         if _whole(node, whole_numbers):
             whole_numbers.add(name)

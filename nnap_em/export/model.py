@@ -81,20 +81,23 @@ def parameters(fitted: Identified) -> dict[str, Any]:
 def unrolled(
     name: str,
     function: Callable[..., tuple[Array, ...]],
+    truth: Callable[..., tuple[Array, ...]] | None = None,
+    names: dict[str, Any] | None = None,
     **arguments: Array,
 ) -> Source:
     """`function` in NumPy, compared with JAX at four random places about `arguments`.
 
+    The numbers of JAX are those of `truth`, where the function has others by their `names` in it.
     Raises ExportError where there is no such source, or where its numbers are others.
     """
     try:
         source = unroll(name, function, **arguments)
     except UnrollError as error:
         raise ExportError(str(error)) from None
-    rng, space = np.random.default_rng(0), {"np": np}
+    rng, space = np.random.default_rng(0), {"np": np, **(names or {})}
     centres = [np.asarray(a) for a in arguments.values()]
     places = [np.where(a == 0, 3.0, 0.1 * a) * rng.normal(size=(4, *a.shape)) + a for a in centres]
-    expected = jax.jit(jax.vmap(function))(*(jnp.asarray(a, jnp.result_type(float)) for a in places))
+    expected = jax.jit(jax.vmap(truth or function))(*(jnp.asarray(a, jnp.result_type(float)) for a in places))
     exec(str(source), space)  # what the exported program does
     with np.errstate(all="ignore"):
         outputs = cast(Callable, space[name])(*(tuple(a.reshape(4, -1).T) for a in places))

@@ -1,5 +1,7 @@
 """The observer of a fit as C99: the filter of `fit/observer.py` by square roots, and the model in scalars."""
 
+import dataclasses
+import math
 import re
 from pathlib import Path
 from string import Template
@@ -9,17 +11,74 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
+from jaxtyping import Float
 
 from .. import __version__
 from ..em.prior import ParameterPrior
 from ..fit import observer as observing
 from ..fit.identify import Identified
 from ..model import hooks
+from ..model.friction import FrictionNetwork
 from ..model.state_space import Inputs, StateSpaceModel
 from ..smoother.mixture import WIDE_STD
 from ..storage.files import replace_own
 from .c99 import WHOLE, Dialect, function, identifier
 from .model import ExportError, states_of, unrolled
+from .unroll import named
+
+DEGREE = 7
+"""Degree of the polynomials of a friction table."""
+
+
+class Table(NamedTuple):
+    """A friction curve as polynomials in s = 1 + |v| / knee, on equal parts of every octave of s, for v >= 0 and v < 0.
+
+    The leading bits of a floating number are those of its octave and part: no logarithm finds the polynomial.
+    """
+
+    name: str
+    knee: float
+    bits: int
+    """Halvings of an octave."""
+    rows: Float[np.ndarray, "segment entry"]
+    """Coefficients, and the s that they are about."""
+
+    def __call__(self, v: np.ndarray) -> np.ndarray:
+        """Torque at velocities."""
+        half, s = len(self.rows) // 2, 1 + np.abs(v) / self.knee
+        segment = np.clip(np.searchsorted(self.rows[:half, -1], s, "right") - 1, 0, half - 1) + np.where(v < 0, half, 0)
+        powers = np.stack([(s - self.rows[segment, -1]) ** k for k in range(DEGREE + 1)], axis=-1)
+        return np.sum(self.rows[segment, :-1] * powers, axis=-1)
+
+    def text(self, dialect: Dialect) -> str:
+        """The table and its function in C; beyond its ends is the network."""
+        half, number = len(self.rows) // 2, dialect.number
+        rows = ",\n".join("    {" + ", ".join(number(float(x)) for x in row) + "}" for row in self.rows)
+        ends = f"{number(1 / self.knee)}, {number(float(2 ** (half >> self.bits)))}, {self.bits}, {half}"
+        return (
+            f"static const real {self.name}_rows[{2 * half}][DEGREE + 2] = {{\n{rows}}};\nTABLE({self.name}, {ends})\n"
+        )
+
+
+def table(curve: Any, name: str, speed: float, knee: float, share: float) -> Table | None:
+    """A curve as a table that errs by `share` of its size at most, if one does."""
+    unit = 0.5 - 0.5 * np.cos(np.pi * (np.arange(DEGREE + 1) + 0.5) / (DEGREE + 1))  # Chebyshev's nodes
+    beyond = 6.0  # end of the table over the largest rate of interest: the first estimates in motion are that wide
+    checks, octaves = np.linspace(0.0, 1.0, 13), math.ceil(math.log2(1 + beyond * speed / knee))
+    for bits in range(2, 6):  # halvings of an octave
+        width = np.repeat(2.0 ** (np.arange(octaves) - bits), 2**bits)
+        edge = 1 + np.cumsum(width) - width
+
+        def values(at: np.ndarray, edge=edge, width=width) -> np.ndarray:
+            size = knee * (edge[:, None] + width[:, None] * at - 1)
+            return np.asarray(curve(jnp.asarray(np.concatenate([size, -size])).ravel())).reshape(-1, len(at))
+
+        coefficients, truth = np.linalg.solve(np.vander(unit, increasing=True), values(unit).T).T, values(checks)
+        error = np.max(np.abs(coefficients @ np.vander(checks, DEGREE + 1, increasing=True).T - truth))
+        if error <= share * np.max(np.abs(truth)):
+            scaled = coefficients / np.tile(width, 2)[:, None] ** np.arange(DEGREE + 1)
+            return Table(name, knee, bits, np.column_stack([scaled, np.tile(edge, 2)]))
+    return None
 
 
 def write_observer(fitted: Identified, out: Path | str, *, single: bool = False) -> None:
@@ -85,18 +144,36 @@ def _cast(a: Any) -> Any:
 
 
 def _functions(model: StateSpaceModel, prior: ParameterPrior, dialect: Dialect) -> tuple[list[str], int]:
-    """Rate, reading and commands in C, and the size of the memory of the commands."""
-    system = model.system
+    """Friction tables, rate, reading and commands in C, and the size of the memory of the commands."""
+    # Largest error of a friction table over the size of the torque, in 64 and 32 bits; else the network is kept
+    exact = {False: 1e-11, True: 1e-6}
+    system, share = model.system, exact[dialect.single]
     dof, drives = len(system.coordinates), len(system.joints)
     scales = len({place for servo in model.servos or () for _, place, _ in servo.scales})
+    network, tables, texts = model.unknown, {}, []
+    if isinstance(network, FrictionNetwork):
+        for j in range(dof):
+            curve = jax.jit(jax.vmap(lambda v, j=j: network.torque(jnp.full(dof, v))[j]))
+            found = table(curve, f"friction{j + 1}", float(network.speed[j]), float(network.knee[j]), share)
+            if found is not None:
+                tables[j] = found
+                one = lambda v, j=j: (network.torque(jnp.full(dof, v[0]))[j],)  # noqa: E731
+                texts += [function(unrolled(f"{found.name}_network", one, v=jnp.ones(1)), dialect), found.text(dialect)]
+
+    def unknown(v):
+        torque = network(v)
+        return jnp.stack(
+            [named(tables[j].name, lambda x, j=j: tables[j](x), v[j]) if j in tables else torque[j] for j in range(dof)]
+        )
 
     def inputs(row) -> Inputs:
         u, before, time, age = row[:drives], row[drives : 2 * drives], row[2 * drives], row[2 * drives + 1]
         change = jnp.zeros((2, drives), u.dtype) if model.smooth else None
         return Inputs(u, before, time, age, row[2 * drives + 2 :] if scales else None, change)
 
-    def rate(x, row, p):
-        return (prior.write(model, p[: prior.size]).rate(x, inputs(row), jnp.zeros(dof, x.dtype)),)
+    def rate(x, row, p, friction=unknown):
+        written = dataclasses.replace(prior.write(model, p[: prior.size]), unknown=friction)
+        return (written.rate(x, inputs(row), jnp.zeros(dof, x.dtype)),)
 
     def reading(x, row, p):
         read = prior.write(model, p[: prior.size]).emission
@@ -114,14 +191,16 @@ def _functions(model: StateSpaceModel, prior: ParameterPrior, dialect: Dialect) 
 
     size = prior.size + len(model.measured) + model.log_q.shape[0]
     row, p = jnp.zeros(2 * drives + 2 + scales), jnp.concatenate([prior.read(model), jnp.ones(size - prior.size)])
+    spaces = {found.name: found for found in tables.values()}
     x = jnp.asarray(model.start.mean)
+    true = lambda x, row, p: rate(x, row, p, network)  # noqa: E731
     sources = [
-        unrolled("rate", rate, x=x, row=row, p=p),
+        unrolled("rate", rate, true, spaces, x=x, row=row, p=p),
         unrolled("reading", reading, x=x, row=row, p=p),
         unrolled("commands", commands, memory=flat, u=jnp.zeros(drives + scales), first=jnp.ones(1), p=p),
     ]
-    first = function(sources[0], dialect, points="2 * N")
-    return [first, *(function(source, dialect) for source in sources[1:])], flat.size
+    texts.append(function(sources[0], dialect, points="2 * N"))
+    return [*texts, *(function(source, dialect) for source in sources[1:])], flat.size
 
 
 def _source(fitted: Identified, stem: str, dialect: Dialect, functions: list[str], memory: int) -> str:
@@ -135,7 +214,8 @@ def _source(fitted: Identified, stem: str, dialect: Dialect, functions: list[str
         "PARAMETERS": len(own.names), "NOISE": len(own.names) - n - m, "PROCESS": len(own.names) - n,
         "COURSE": 2 * drives + 2 + scales, "ROW": 4 * drives + 2 + scales + 1,
         "SUBSTEPS": model.steps, "SETTLING": observing.SETTLING, "ANGLES": len(angles),
-        "LONGEST_GAP": max(10, round(1 / model.dt)),
+        "LONGEST_GAP": max(10, round(1 / model.dt)), "DEGREE": DEGREE,
+        "DIGITS": 23 if dialect.single else 52, "BIAS": 127 if dialect.single else 1023,
     }  # fmt: skip
     reals = {
         "GATE": observing.GATE, "FORGET": observing.FORGET, "DIVERGED": observing.DIVERGED, "TWIN": observing.TWIN,
@@ -150,8 +230,8 @@ def _source(fitted: Identified, stem: str, dialect: Dialect, functions: list[str
     calls = ("sqrt", "fabs", "exp", "log", "fmax")
     lines = [
         f"/* Observer of {_comment(fitted.rig.name)}: written by nnap_em {__version__}.  Link with -lm. */",
-        f'#include "{stem}.h"\n\n#include <math.h>\n',
-        f"typedef {name}_real real;",
+        f'#include "{stem}.h"\n\n#include <math.h>\n#include <stdint.h>\n#include <string.h>\n',
+        f"typedef {name}_real real;\ntypedef uint{32 if dialect.single else 64}_t bits;",
         f"enum {{ {', '.join(f'{key} = {value}' for key, value in sizes.items())} }};",
         f"#define DT {model.dt!r}",
         f"#define SMOOTH {int(model.smooth)}",
@@ -167,6 +247,7 @@ def _source(fitted: Identified, stem: str, dialect: Dialect, functions: list[str
             *lines,
             "",
             WHOLE.replace("double", dialect.real),
+            _template("table.c", name),
             *functions,
             _template("observer.c", name),
         ]

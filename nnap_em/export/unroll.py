@@ -40,6 +40,16 @@ class UnrollError(ValueError):
     """An operation that cannot be written in plain NumPy, by the name of JAX's primitive."""
 
 
+_named = core.Primitive("named")
+_named.def_abstract_eval(lambda x, function, value: x)
+_named.def_impl(lambda x, function, value: jnp.asarray(value(np.asarray(x)), x.dtype))
+
+
+def named(function: str, value: Callable[[np.ndarray], np.ndarray], x: jax.Array) -> jax.Array:
+    """A function of a scalar that is written by its name; `value` has its numbers."""
+    return _named.bind(x, function=function, value=value)
+
+
 class Source(NamedTuple):
     """A Python function of NumPy scalars or equal batches."""
 
@@ -187,6 +197,8 @@ def _equation(writer: _Writer, equation: core.JaxprEqn, operands: list[np.ndarra
         return [_each(writer, _converted(_dtype(equation.invars[0]).kind, params["new_dtype"].kind), operands)]
     if name == "integer_pow":
         return [_each(writer, f"{{}} ** {params['y']}", operands)]
+    if name == "named":
+        return [_each(writer, f"{params['function']}({{}})", operands)]
     if name in _ELEMENTWISE:
         return [_each(writer, _ELEMENTWISE[name], operands)]
     reductions = {"reduce_sum": "add", "reduce_max": "max", "reduce_min": "min", "reduce_prod": "mul"}

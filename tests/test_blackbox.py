@@ -67,6 +67,7 @@ def fitted() -> tuple[NetworkModel, list[float]]:
     return state.model, list(state.loglik)
 
 
+@pytest.mark.slow  # fast: test_loss_falls_to_that_of_the_true_transition_on_true_states
 def test_one_step_prediction_reaches_the_noise_floor(fitted):
     truth = _oscillator()
     test, _ = _record(truth, 40, 150, key=jax.random.key(7))
@@ -77,6 +78,7 @@ def test_one_step_prediction_reaches_the_noise_floor(fitted):
     assert np.mean(best - learned) / (150 * 2) < 0.02
 
 
+@pytest.mark.slow  # fast: test_loss_falls_to_that_of_the_true_transition_on_true_states
 def test_one_step_mean_is_that_of_the_linear_system(fitted):
     truth = _oscillator()
     test, x = _record(truth, 40, 150, key=jax.random.key(8))
@@ -86,12 +88,14 @@ def test_one_step_mean_is_that_of_the_linear_system(fitted):
     assert np.all(rms < np.sqrt(0.05) * np.exp(0.5 * truth.log_q))
 
 
+@pytest.mark.slow  # fast: test_loss_falls_to_that_of_the_true_transition_on_true_states
 def test_likelihood_rises(fitted):
     _, loglik = fitted
     assert loglik[-1] > loglik[0]
     assert min(np.diff(loglik)) > -1.0  # nats of some 600; the gradient is drawn
 
 
+@pytest.mark.slow  # fast: test_loss_falls_to_that_of_the_true_transition_on_true_states
 def test_noise_is_recovered(fitted):
     truth = _oscillator()
     np.testing.assert_allclose(np.exp(0.5 * fitted[0].log_r), np.exp(0.5 * truth.log_r), rtol=0.25)

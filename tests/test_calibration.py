@@ -120,6 +120,7 @@ def test_innovations_are_chi_square(name, rule):
     _inside(square.sum(), run.observed.sum())  # innovations are independent of each other: 1 % of the variance shows
 
 
+@pytest.mark.slow  # fast: test_innovations_are_chi_square
 def test_truth_has_any_rank_among_the_trajectories():
     """Uniform where the draws are from the posterior [Talts et al. 2018]; every state of three rows."""
     model, data, x = _logs("acrobot")
@@ -135,6 +136,7 @@ def test_truth_has_any_rank_among_the_trajectories():
     assert np.all(p > LEVEL / p.size)
 
 
+@pytest.mark.slow  # fast: test_innovations_are_chi_square
 def test_friction_band_holds_its_share_of_the_truth():
     """Frictions drawn from the prior of the fit, one velocity each: `benchmarks/calibration.py` in small."""
     draws = 12

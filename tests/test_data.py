@@ -172,7 +172,7 @@ def test_what_cannot_be_read_back_is_not_written(tmp_path, columns):
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.slow
+@pytest.mark.slow  # fast: tests of one log each, here
 def test_every_shared_log_is_read_without_a_word(shared):
     paths = [path for path in data_sets(shared) if path.parents[1].name != "ode"]  # plants as strangers logged them
     assert len(paths) > 10

@@ -159,7 +159,7 @@ def test_information_along_the_logs_is_the_curvature_of_their_fit(slide):
     np.testing.assert_allclose(std, fits, rtol=0.05)
 
 
-@pytest.mark.slow
+@pytest.mark.slow  # fast: test_information_along_the_logs_is_the_curvature_of_their_fit
 def test_what_is_promised_is_what_a_fit_then_states_and_the_truth_is_near(slide):
     """The design is played by the model that made the logs, with noise of its own."""
     _, rig, data, fitted = slide

@@ -84,9 +84,13 @@ def test_every_block_is_run_or_says_why_not():
             assert block.reason is None or block.reason.strip(), f"{page}:{block.line}"
 
 
-@pytest.mark.slow
+RUNNING = [p for p in PAGES if any(b.kind in RUN for b in _blocks(p))]
+
+
 @pytest.mark.parametrize(
-    "page", [p for p in PAGES if any(b.kind in RUN for b in _blocks(p))], ids=lambda p: str(p.relative_to(ROOT))
+    "page",
+    [pytest.param(p, marks=() if p.name == "README.md" else pytest.mark.slow) for p in RUNNING],
+    ids=[str(p.relative_to(ROOT)) for p in RUNNING],
 )
 def test_page_runs(page, tmp_path, monkeypatch, registries):
     monkeypatch.chdir(tmp_path)

@@ -203,6 +203,7 @@ def test_all_lost_is_said(run):
         identify(run.rig, data, key=jax.random.key(0), start=state)
 
 
+@pytest.mark.slow  # fast: test_fit_is_the_maximum_likelihood_estimate
 @pytest.mark.parametrize("kind", ["slide", "pendulum"])
 def test_friction_curve_is_recovered(kind):
     """Position read only, Stribeck friction: NRMSE below 3 %, the demand of the project."""

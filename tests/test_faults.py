@@ -226,7 +226,7 @@ def _struck(order: list[str], out: Path, kind: signal.Signals, count: int):
     return run.returncode, said
 
 
-@pytest.mark.slow
+@pytest.mark.slow  # fast: test_a_chain_of_all_faults_is_survived
 @pytest.mark.parametrize("command", [IDENTIFY, DIAGNOSE], ids=lambda command: command[0])
 def test_a_command_that_is_killed_and_stopped_goes_on_to_the_same_numbers(rig, whole, tmp_path, command):
     """By SIGKILL, and then by Ctrl-C."""

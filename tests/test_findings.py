@@ -169,7 +169,7 @@ def test_a_suspect_is_named_with_its_share_and_the_chance_level():
         assert advice([], (), [suspect._replace(law=law)])[1].startswith(f"To see {named} by itself")
 
 
-@pytest.mark.slow
+@pytest.mark.slow  # fast: sentences of findings, here
 def test_the_page_tells_what_is_in_doubt(tmp_path):
     logs = Logs(("a.csv", "b.csv"), _data(ARM), ("time", "u", "theta1", "theta2"))
     doubtful = _doubtful()
@@ -190,7 +190,7 @@ def test_the_page_tells_what_is_in_doubt(tmp_path):
     assert "<h2>Suspects" in html.replace(' id="suspects"', "") and "chance removes up to 3%" in html
 
 
-@pytest.mark.slow
+@pytest.mark.slow  # fast: sentences of findings, here
 def test_the_page_draws_what_is_left_beside_a_law(tmp_path):
     diagnosis = _closed(SLIDE, _spring(1), _function("x", 1, 5.0))
     logs = Logs(("a.csv", "b.csv"), _data(SLIDE), ("time", "u", "x"))

@@ -119,6 +119,7 @@ def around_rod(model):
     )  # fmt: skip
 
 
+@pytest.mark.slow  # fast: test_a_form_is_that_of_the_paper
 def test_torques_of_motor_and_load_apart_are_found_on_one_joint(tmp_path):
     """The law by the motor's torque alone is found first, then the share of the load's."""
     data = rod.logs(0, level=lambda u, c, v: np.abs(0.15 * u + 0.05 * c))

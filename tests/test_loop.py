@@ -53,7 +53,7 @@ def test_other_recordings_of_the_machine_compile_nothing(tmp_path):
     assert {name: stages for name, stages in profile.spent.items() if stages["compile"]} == {}
 
 
-@pytest.mark.slow
+@pytest.mark.slow  # fast: test_other_recordings_of_the_machine_compile_nothing
 def test_a_spring_of_a_slide_through_the_command(tmp_path):
     """Named and sized; the report exact to the interface; the reported errors those of `predict`."""
     plant.write(SLIDE._replace(effects=(SPRING, DRAG)), tmp_path / "rig")

@@ -6,6 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from helpers import data_sets
 
 from nnap_em.data.dataset import Dataset
@@ -27,6 +28,7 @@ def _read(folder: Path, sequences: int, rows: int) -> tuple[Rig, Dataset]:
     return rig, jax.tree.map(lambda a: jnp.asarray(a[:sequences, :rows]), data)
 
 
+@pytest.mark.slow  # fast: test_a_measured_arm_is_identified
 def test_every_shared_rig_has_a_finite_first_e_step(shared):
     folders = [path.parent for path in data_sets(shared)]
     assert folders

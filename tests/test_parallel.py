@@ -123,7 +123,7 @@ def _launched(*order: object, **options) -> Iterator[subprocess.Popen]:
         run.kill()
 
 
-@pytest.mark.slow
+@pytest.mark.slow  # fast: test_groups_change_nothing
 def test_devices_agree(rig):
     """Five sequences over 1 and 4 devices, and one at a time."""
     subprocess.run([sys.executable, "-c", DEVICES, str(rig)], env=ENVIRONMENT, check=True, timeout=600)
@@ -150,7 +150,7 @@ def _agree(out: Path, alone: dict[str, np.ndarray]) -> None:
         np.testing.assert_allclose(value, alone[name], rtol=1e-8, atol=1e-8, err_msg=name)
 
 
-@pytest.mark.slow
+@pytest.mark.slow  # fast: test_groups_change_nothing
 def test_processes_agree(rig, alone, tmp_path):
     with _launched(2, "identify", rig, "--epochs", 1, "--out", tmp_path / "out") as run:
         _, said = run.communicate(timeout=300)
@@ -165,7 +165,7 @@ def test_several_machines_need_to_know_their_share():
     assert "--coordinator needs --here N: processes on this machine" in done.stderr
 
 
-@pytest.mark.slow
+@pytest.mark.slow  # fast: test_groups_change_nothing
 def test_two_launchers_are_two_machines(rig, alone, tmp_path):
     place = ["--coordinator", free_address(), "--here", "1", "--first"]
     order = [2, "identify", rig, "--epochs", 1, "--out"]
@@ -184,7 +184,7 @@ def _after_the_first_step(run: subprocess.Popen, out: Path) -> None:
         time.sleep(0.1)
 
 
-@pytest.mark.slow
+@pytest.mark.slow  # fast: test_groups_change_nothing
 def test_ctrl_c_says_how_to_go_on(rig, tmp_path):
     out = tmp_path / "out"
     with _launched(2, "identify", rig, "--epochs", 500, "--out", out, start_new_session=True) as run:
@@ -195,7 +195,7 @@ def test_ctrl_c_says_how_to_go_on(rig, tmp_path):
     assert "to go on: nnap-em identify" in said and "--resume" in said
 
 
-@pytest.mark.slow
+@pytest.mark.slow  # fast: test_groups_change_nothing
 def test_a_dying_process_ends_the_run_and_leaves_the_finished_steps(rig, tmp_path, capsys):
     out = tmp_path / "out"
     with _launched(2, "identify", rig, "--epochs", 500, "--out", out) as run:

@@ -11,6 +11,7 @@ MASS, PLACE = 0.5, (0.15, -0.3)
 """Mass of the load [kg], and its place in the plane of motion [m]."""
 
 
+@pytest.mark.slow  # fast: test_played.py, a payload
 def test_mass_and_centre_of_a_load_on_one_joint_are_found(tmp_path):
     """Weight and inertia of a hinge give mass and centre in the plane of its motion; along the axis nothing is seen."""
     data = rod.logs(0, mass=MASS, at=PLACE)

@@ -147,6 +147,7 @@ def _tag(value) -> str:
     return value if isinstance(value, str) else ""
 
 
+@pytest.mark.slow  # fast: test_effects.py
 @pytest.mark.parametrize(("tag", "joint", "values", "effect"), FORCES, ids=_tag)
 def test_the_model_with_a_force_moves_as_the_recording(tag, joint, values, effect):
     """Up to what the torque that is held over a step leaves: a hundredth of what the effect does."""
@@ -156,6 +157,7 @@ def test_the_model_with_a_force_moves_as_the_recording(tag, joint, values, effec
     assert np.abs(right - x).max() < 0.01 * np.abs(lacking - x).max()
 
 
+@pytest.mark.slow  # fast: test_effects.py
 @pytest.mark.parametrize(("tag", "joint", "values", "effect"), DRIVES, ids=_tag)
 def test_a_drive_makes_the_real_torque_of_the_written_input(tag, joint, values, effect):
     u, x, _, commanded = _recorded((Plant(tag, joint, None), values))
@@ -163,6 +165,7 @@ def test_a_drive_makes_the_real_torque_of_the_written_input(tag, joint, values, 
     np.testing.assert_allclose(_motion(commanded, (effect,)), x, rtol=0, atol=1e-9)
 
 
+@pytest.mark.slow  # fast: test_effects.py
 @pytest.mark.parametrize(("tag", "channel", "values", "effect"), SENSORS, ids=_tag)
 def test_a_sensor_reads_what_the_law_says(tag, channel, values, effect):
     u, x, written, _ = _recorded((Plant(tag, None, channel), values))
@@ -179,6 +182,7 @@ def test_a_sensor_reads_what_the_law_says(tag, channel, values, effect):
     assert written["time"][0] == 0
 
 
+@pytest.mark.slow  # fast: test_effects.py
 def test_two_effects_together_move_as_the_recording():
     """The drive makes of the written input the real torque without the force."""
     (_, joint, spring, force), (_, driven, gain, drive) = FORCES[0], DRIVES[0]

@@ -418,6 +418,7 @@ def test_a_limit_seen_in_one_file_holds_for_all(tmp_path):
 SLIDE = plant.Case(system="slide", hidden=False, sequences=6, tests=2, steps=200, noise=(5e-4, 5e-3), seed=4)
 
 
+@pytest.mark.slow  # fast: test_spikes_are_found_row_by_row
 def test_a_fit_survives_spikes_and_check_names_them(tmp_path):
     plant.write(SLIDE, tmp_path)
     rig = read_rig(tmp_path / "rig.toml")

@@ -70,7 +70,7 @@ def test_an_arm_with_an_idle_motor_or_none(joints, columns):
     assert len(remarks) == 1 and names[0] in remarks[0].text and "does not determine the scale" in remarks[0].text
 
 
-@pytest.mark.slow
+@pytest.mark.slow  # fast: test_the_most_closely_declared_mass_carries_the_scale
 def test_the_prior_is_kept_where_nothing_is_told():
     """The ratio of the masses is learned, their scale is not: of a body twice as heavy the logs are the same."""
     fitted = identify(SWING, _swinging(SWING), key=jax.random.key(0), epochs=8)

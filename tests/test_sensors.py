@@ -352,7 +352,7 @@ def test_a_first_rig_has_the_sensors_of_the_log_by_name_or_as_ros_calls_them(tmp
     }  # fmt: skip
 
 
-@pytest.mark.slow
+@pytest.mark.slow  # fast: test_what_accelerometers_feel_of_friction_and_mass_counts_in_score_and_information
 def test_friction_of_a_joint_without_encoder_is_told_by_an_inertial_sensor_at_the_hand(tmp_path):
     """Logs from MuJoCo, 8 s in all: 0.003 is missed; 0.09 where a longer horizon began from the likeliest model."""
     data, x = recorded(machine(2, imu=True), JOINTS[:2], 0)

@@ -373,6 +373,7 @@ def _simulated(path: Path, seed: int, sequences: int = 6, rows: int = 400, inner
     return _logs(np.asarray(commands)[..., None], np.asarray(readings)[..., None])
 
 
+@pytest.mark.slow  # fast: test_a_servo_of_a_file_gives_the_force_of_mujoco
 def test_gain_delay_and_friction_of_mujocos_servo_are_found_and_stored(tmp_path):
     """Within 5 % and 1 ms, friction to 0.08 of its size; it predicts, is stored as it is, and is not exported."""
     lines = 'kind = "position"\nkp = { mean = 9.0, std = 4.0 }\nkd = 0.25\ndelay = { mean = 0.01, std = 0.01 }'

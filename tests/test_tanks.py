@@ -78,6 +78,7 @@ def test_the_error_is_that_after_the_first_fifty_readings():
     assert side.error == pytest.approx(0.5)
 
 
+@pytest.mark.slow  # fast: test_equation_commands.py
 def test_it_runs_from_the_recordings_to_the_figure(tmp_path, monkeypatch, capsys):
     """Nothing is missing in the simulated machine, and its levels are predicted to the noise of the readings."""
     _published(_recordings(), tmp_path)

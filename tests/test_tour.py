@@ -22,7 +22,7 @@ def _cells():
     return [("markdown" if part.startswith(" [markdown]\n") else "code", part.partition("\n")[2]) for part in parts]
 
 
-@pytest.mark.slow
+@pytest.mark.slow  # fast: test_docs.py, README.md
 def test_it_runs_and_finds_the_cable(tmp_path, monkeypatch, capsys):
     """The truth is 30 N/m; the stated standard deviation holds it."""
     monkeypatch.chdir(tmp_path)

@@ -259,7 +259,7 @@ def _ahead(text: str, x: np.ndarray, u: np.ndarray, rows: int = 100) -> float:
     return float(np.sqrt(np.mean(np.square(wrong))))
 
 
-@pytest.mark.slow
+@pytest.mark.slow  # fast: test_a_written_machine_is_the_same_in_mujoco
 def test_friction_of_an_unread_pole_is_found_and_the_written_file_predicts_better(tmp_path):
     rig = _rig(parameters={"pole.mass": Declared(0.23, 0.05)})  # the owner's belief is off; the plant has 0.2
     data, x = _logs(rig, sequences=8, rows=400)

@@ -89,6 +89,7 @@ def closed(fit):
     return diagnose(_rig(), _logs(1, GROWN), key=jax.random.key(0), start=fit, own=_logs(0))
 
 
+@pytest.mark.slow  # fast: test_a_machine_that_did_not_change_is_said_to_be_the_same
 def test_friction_that_grew_is_named_with_its_size(closed, tmp_path):
     """Inside two of its standard deviations, alone; the outcome can be stored, with the machine as it is now."""
     (found,) = findings(closed)
@@ -100,6 +101,7 @@ def test_friction_that_grew_is_named_with_its_size(closed, tmp_path):
     assert float(load(tmp_path / "after.npz").model.effects[0].change) == float(found.effect.change)
 
 
+@pytest.mark.slow  # fast: test_a_machine_that_did_not_change_is_said_to_be_the_same
 def test_nothing_changed_since_a_fit_that_has_a_law(closed):
     """The law of the fit is no finding, and stays."""
     again = diagnose(_rig(), _logs(3, GROWN), key=jax.random.key(0), start=closed.after, own=_logs(1, GROWN))
@@ -113,7 +115,7 @@ def test_a_machine_that_did_not_change_is_said_to_be_the_same(fit):
     assert changes(closed, []).startswith("Nothing changed since the fit that these recordings could show: errors")
 
 
-@pytest.mark.slow  # fast: test_nothing_changed_since_a_fit_that_has_a_law
+@pytest.mark.slow  # fast: test_a_machine_that_did_not_change_is_said_to_be_the_same
 def test_a_law_that_was_missing_before_is_no_change():
     """A spring that neither the rig nor the fit knows, in all recordings: 2 N/m."""
     spring, said = TorsionalSpring.of(2.0, 0.0, 0.0, 0.0, joint=1), []
@@ -124,7 +126,7 @@ def test_a_law_that_was_missing_before_is_no_change():
     assert any("spring" in line and "missing there, and no change" in line for line in said), said
 
 
-@pytest.mark.slow  # fast: test_nothing_changed_since_a_fit_that_has_a_law
+@pytest.mark.slow  # fast: test_a_machine_that_did_not_change_is_said_to_be_the_same
 def test_a_law_that_the_recordings_of_the_fit_show_as_well_is_no_change():
     good = {"possible": True, "certainty": 50.0, "amplitude": 50.0, "removed": 0.5, "floor": 0.15, "complexity": 0}
     assert veto(**good) is None

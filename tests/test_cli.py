@@ -220,6 +220,7 @@ def test_results_that_will_be_replaced_are_named_before(bench, tmp_path, monkeyp
     assert first == second == "nnap-em: error: the fit would begin here"
 
 
+@pytest.mark.slow  # fast: test_particle.py
 def test_particles_identify_as_well(bench, fit, tmp_path):
     """Two epochs with few particles, against the same epochs of the cubature smoother: the slide is almost linear."""
     argv = ("--smoother", "particle", "--particles", 50, "--epochs", 2, "--quiet")

@@ -82,6 +82,7 @@ def changed(fits) -> Comparison:
     return compare(fits.first, str(fits.grown / "model.npz"))
 
 
+@pytest.mark.slow  # fast: tests of one comparison, here
 def test_nothing_changed_between_two_halves_of_a_data_set(unchanged):
     assert unchanged.names == ("first", "second")
     assert unchanged.changed == unchanged.warnings == ()

@@ -253,6 +253,7 @@ def designed(slide) -> Path:
     return folder / "next"
 
 
+@pytest.mark.slow  # fast: test_no_motion_of_a_design_leaves_what_the_logs_visited
 def test_the_command_writes_what_can_be_played_and_a_page(slide, designed):
     expected = json.loads((designed / "design.json").read_text())
     assert expected["inputs"] == [f"inputs/{i}.csv" for i in range(1, 5)] and expected["seconds_each"] == 1.5
@@ -267,6 +268,7 @@ def test_the_command_writes_what_can_be_played_and_a_page(slide, designed):
     assert not (designed / "unfinished").exists()
 
 
+@pytest.mark.slow  # fast: test_no_motion_of_a_design_leaves_what_the_logs_visited
 def test_old_and_new_logs_are_fitted_together(slide, designed, tmp_path, capsys, monkeypatch):
     """The new logs are the old ones with other names and other noise: all are there, each once, from another folder."""
     folder, _, data, _ = slide

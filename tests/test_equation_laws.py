@@ -223,6 +223,7 @@ def test_a_declared_unknown_term_is_part_of_the_model(tmp_path):
     assert labels == ["b [V]u", "f [V/s]"]
 
 
+@pytest.mark.slow  # fast: test_a_search_that_fails_late_or_is_out_of_time_keeps_what_it_has
 @pytest.mark.parametrize(("coupling", "names"), [(0.25, {("a", ("b",))}), (0.0, set())], ids=["planted", "nothing"])
 def test_a_missing_flow_is_named_and_nothing_where_nothing_is_missing(tmp_path, coupling, names, monkeypatch):
     monkeypatch.setattr(equations, "PARTNERS", 4)  # 6 pairs in place of 120

@@ -28,6 +28,7 @@ def _extended(fitted, model):
     return extend(context, Hypothesis(model, before.m_step), rod.ROWS), lines
 
 
+@pytest.mark.slow  # fast: test_friction_that_is_right_is_gone_on_from
 def test_friction_too_steep_for_the_integration_is_left(fitted):
     """No step leads from 200 N m at 0.02 rad/s to a friction of 0.1 N m and 0.05 N m s/rad; a fit from the start does.
 

@@ -149,6 +149,7 @@ FAULTS: list[tuple[str, int | str]] = [
 ]
 
 
+@pytest.mark.slow  # fast: test_a_step_is_done_once_for_the_same_arguments
 def test_a_chain_of_all_faults_is_survived(rig, whole, tmp_path, monkeypatch, capsys):
     """One run that meets all the faults, one after the other, and then goes on to its end; numbers as of no fault."""
     monkeypatch.setattr(identify_command, "identify", _toy_identify(load(whole["identify"] / "model.npz")))
@@ -226,7 +227,7 @@ def _struck(order: list[str], out: Path, kind: signal.Signals, count: int):
     return run.returncode, said
 
 
-@pytest.mark.slow  # fast: test_a_chain_of_all_faults_is_survived
+@pytest.mark.slow  # fast: test_a_step_is_done_once_for_the_same_arguments
 @pytest.mark.parametrize("command", [IDENTIFY, DIAGNOSE], ids=lambda command: command[0])
 def test_a_command_that_is_killed_and_stopped_goes_on_to_the_same_numbers(rig, whole, tmp_path, command):
     """By SIGKILL, and then by Ctrl-C."""

@@ -75,6 +75,7 @@ def _nugget(cov, torque):
     return cov + np.diag(0.01 * np.diag(cov) + (0.005 * np.abs(torque).max()) ** 2)
 
 
+@pytest.mark.slow  # fast: test_what_the_curve_does_not_show_has_a_large_std
 def test_std_is_the_scatter_of_repeated_tables():
     v = _nodes()
     cov = _kernel(v, 1e-3)
@@ -90,6 +91,7 @@ def test_std_is_the_scatter_of_repeated_tables():
     assert 0.01 < float(np.mean(fits.departs)) < 0.09
 
 
+@pytest.mark.slow  # fast: test_what_the_curve_does_not_show_has_a_large_std
 def test_what_a_curve_hardly_shows_is_within_two_standard_deviations():
     """The Stribeck peak of a slide within the band of its curve near rest: the posterior of its numbers is bent."""
     truth, v, n = (1.0, 1.5, 0.05, 2.0, 0.02), _nodes(top=1.4), 24

@@ -71,7 +71,7 @@ LAWS = {
     ),
     "a torque of a late servo": ((), (Servo("f", "torque", {"delay": NUMBER(0.03)}),)),
     "a gain from a column": ((), (Servo("goal", "position", {"kp": NUMBER(8.0)}, (("kp", 0, 0.2),)),)),
-    "a bristle": ((catalogue["presliding_friction"].of(1.0, 0.1, 0.2, 0.1, 0.5, 200.0, joint=1),), None),
+    "a bristle": ((catalogue["presliding_friction"].of(0.0, 0.1, 0.0, 0.5, 0.5, 20.0, joint=1),), None),
 }  # fmt: skip
 
 

@@ -28,8 +28,10 @@ def main() -> None:
     first = min((FOLDERS.index(folder) if folder in FOLDERS else 0 for folder in inside), default=len(FOLDERS))
     for path in sorted((ROOT / "tests").glob("test_*.py")):
         text, name = path.read_text(), f"tests/{path.name}"
-        used = {FOLDERS.index(folder) for folder in re.findall(r"nnap_em\.(\w+)", text) if folder in FOLDERS}
-        last = max(used, default=len(FOLDERS) - 1)  # by the package's top or an example all of it may be used
+        used = {FOLDERS.index(folder) for folder in re.findall(r"from nnap_em\.(\w+)", text) if folder in FOLDERS}
+        # by the package's top, a command or an example all of it may be used
+        top = re.search(r"(?m)^\s*(import nnap_em|from nnap_em import)", text)
+        last = len(FOLDERS) - 1 if top or not used else max(used)
         if "mark.slow" in text and (name in changed or first <= last):
             print(name)
 

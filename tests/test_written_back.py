@@ -19,7 +19,7 @@ from nnap_em.data.machine import unpacked
 from nnap_em.data.rig import Declared, Rig, read_rig
 from nnap_em.effects.body import Payload
 from nnap_em.effects.position import Cogging, TorsionalSpring
-from nnap_em.export.friction import friction_form
+from nnap_em.export.friction import FrictionForm, friction_form
 from nnap_em.export.mjcf import write_mjcf
 from nnap_em.export.model import ExportError, write_model
 from nnap_em.fit.identify import Identified, begin
@@ -202,6 +202,14 @@ def test_found_springs_loads_and_changed_numbers_are_written_and_the_rest_is_tol
     assert model.body("cart").mass[0] == pytest.approx(1.3)
     np.testing.assert_allclose([np.ravel(model.jnt_stiffness[1])[0], model.qpos_spring[1]], [0.8, 0.5])
     assert model.dof_armature[0] == pytest.approx(0.2)
+
+
+def test_a_breakaway_torque_is_named_and_coulomb_friction_written(tmp_path, monkeypatch):
+    forms = [FrictionForm(0.3, 0.5, 0.1, 0.2), FrictionForm(0.1, 0.1, 1.0, 0.05)]
+    monkeypatch.setattr("nnap_em.export.mjcf.friction_forms", lambda _: forms)
+    assert write_mjcf(_begun(), tmp_path / "out.xml") == ["breakaway of rail: 0.5 over a Coulomb friction of 0.3"]
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "out.xml"))
+    np.testing.assert_allclose([model.dof_frictionloss, model.dof_damping], [[0.3, 0.1], [0.2, 0.05]])
 
 
 def test_coulomb_and_viscous_friction_are_read_off_a_curve():

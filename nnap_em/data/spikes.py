@@ -23,7 +23,7 @@ def spikes(y: Float[np.ndarray, " time"]) -> Int[np.ndarray, " row"]:
     while True:
         sigma = max(reading_noise(y[None]), 1e-9 * float(np.nanmax(np.abs(y), initial=0.0)), 1e-300)
         tried = list(_candidates(y, sigma))
-        alone = [int(run[0]) for run in tried if run.size == 1]
+        alone = np.array([run[0] for run in tried if run.size == 1], int)
         confirmed = [run for run in tried if _is_spike(y, run, alone, sigma)]
         if not confirmed:
             return np.array(sorted(out), int)
@@ -70,17 +70,19 @@ def _candidates(y: Float[np.ndarray, " time"], sigma: float) -> Iterator[Int[np.
         yield from left.rows[far]
 
 
-def _is_spike(y: Float[np.ndarray, " time"], run: Int[np.ndarray, " row"], alone: list[int], sigma: float) -> bool:
+def _is_spike(
+    y: Float[np.ndarray, " time"], run: Int[np.ndarray, " row"], alone: Int[np.ndarray, " other"], sigma: float
+) -> bool:
     """True where the neighbours agree without the run; one of them that may be a spike itself may be left out."""
     if _stands_out(y, run, sigma, _SIDE) or _stands_out(y, run, sigma, _NEAR):
         return True
     pair = 2.5  # times as large it must be where another row near by has to be left out to see it
-    for other in alone:
-        if 2 <= np.min(np.abs(run - other)) <= _SIDE:
-            without = y.copy()
-            without[other] = np.nan
-            if _stands_out(without, run, sigma, _SIDE, pair):
-                return True
+    away = np.maximum(run[0] - alone, alone - run[-1])
+    for other in alone[(away >= 2) & (away <= _SIDE)]:
+        without = y.copy()
+        without[other] = np.nan
+        if _stands_out(without, run, sigma, _SIDE, pair):
+            return True
     return False
 
 
@@ -102,14 +104,15 @@ class _Fit(NamedTuple):
 
 def _fit(y: Float[np.ndarray, " time"], run: Int[np.ndarray, " row"], side: int) -> _Fit:
     seen = np.flatnonzero(np.isfinite(y))
-    before, after = seen[seen < run[0]][-side:], seen[seen > run[-1]][:side]
-    end = min(before.size, after.size) < 3
-    if end:
-        before, after = seen[seen < run[0]][-_SIDE - 2 :], seen[seen > run[-1]][: _SIDE + 2]
+    first, last = np.searchsorted(seen, [run[0], run[-1] + 1])
+    end = min(first, seen.size - last) < 3
+    side = _SIDE + 2 if end else side
+    before, after = seen[max(first - side, 0) : first], seen[last : last + side]
     rows = np.concatenate([before, run, after])
     x = (rows - run.mean()) / (rows[-1] - rows[0])
     base = np.vander(x, 3 if end else 4)
-    keep = ~np.isin(rows, run)
+    keep = np.full(rows.size, True)
+    keep[before.size : before.size + run.size] = False
     left = y[rows] - base @ np.linalg.lstsq(base[keep], y[rows][keep], rcond=None)[0]
     residual, freedom = float(left[keep] @ left[keep]), max(int(keep.sum()) - base.shape[1], 1)
     return _Fit(x, y[rows], base, float(np.min(np.abs(left[~keep]))), residual, freedom, end)

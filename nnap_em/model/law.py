@@ -129,7 +129,7 @@ def nearest(
 
     Without `dip` the breakaway torque is the Coulomb torque, without `constant` the constant torque is 0.
     """
-    posterior = _Posterior(v, torque, whitener)
+    posterior = _Posterior(v, torque, whitener, _sizes(v, torque))
     return posterior.natural(posterior.modes(dip, constant, at_start=True)[0][1])
 
 
@@ -142,13 +142,9 @@ class _Posterior(NamedTuple):
     v: Float[np.ndarray, " node"]
     torque: Float[np.ndarray, " node"]
     whitener: Float[np.ndarray, "node node"]
+    wide: Float[np.ndarray, " param"]
+    """Sizes of the numbers by the range of the curve."""
     middle: Float[np.ndarray, " param"] = np.array([0.0, 0.0, np.log(0.1), 0.0, np.log(0.02), 0.0])
-
-    @property
-    def wide(self) -> Float[np.ndarray, " param"]:
-        """Sizes of the numbers by the range of the curve."""
-        top, scale = np.max(np.abs(self.v)), max(float(np.max(np.abs(self.torque))), 1e-9)
-        return np.array([scale, scale, top, scale / top, top, scale])
 
     def natural(self, z: Float[np.ndarray, "... param"]) -> Float[np.ndarray, "... param"]:
         """PARAMETERS of laws."""
@@ -158,11 +154,11 @@ class _Posterior(NamedTuple):
 
     def residual(self, z: Float[np.ndarray, "law param"]) -> Float[np.ndarray, "law row"]:
         """Residuals of laws, those of a prior behind them that only holds what the curve does not determine."""
-        levels = np.array([[1, 0, 0, 0, 0, 0], [-1, 1, 0, 0, 0, 0], [0, 0, 0, 1, 0, 0], [0, 0, 0, 0, 0, 1]])
-        levels, times = levels / self.wide[[0, 1, 3, 5], None], np.eye(6)[[2, 4]] / 2.0
         value = self.natural(z)
         away = (self.torque - curve(value.T[..., None], self.v)) @ self.whitener.T
-        return np.concatenate([away, value @ levels.T, (z - self.middle) @ times.T], axis=1)
+        levels = np.stack([value[:, 0], value[:, 1] - value[:, 0], value[:, 3], value[:, 5]], 1)
+        times = (z - self.middle)[:, [2, 4]] / 2.0
+        return np.concatenate([away, levels / self.wide[[0, 1, 3, 5]], times], axis=1)
 
     def log_density(self, z: Float[np.ndarray, "law param"]) -> Float[np.ndarray, " law"]:
         """Levels are as likely before as they are wide, not as their logarithms."""
@@ -176,18 +172,31 @@ class _Posterior(NamedTuple):
         for knee, sharpness in itertools.product(np.log([0.02, 0.1, 0.4]) if dip else [0.0], np.log([0.02, 0.1, 0.4])):
             no_dip = -200.0  # its logarithm
             full = np.array([np.log(0.3), np.log(0.3) if dip else no_dip, knee, np.log(0.3), sharpness - 1.5, 0.0])
+            own = self._replace(middle=full) if at_start else self
 
-            own = self._replace(middle=full.copy()) if at_start else self
+            def laws(z, full=full):
+                out = np.tile(full, (len(z), 1))
+                out[:, free] = z
+                return out
 
-            def residual(z, full=full, own=own):
-                full[free] = z
-                return own.residual(full[None])[0]
+            def residual(z, own=own, laws=laws):
+                return own.residual(laws(z[None]))[0]
+
+            def slopes(z, own=own, laws=laws):
+                step = 1.5e-8 * np.maximum(np.abs(z), 1.0)
+                at, *beside = own.residual(laws(np.vstack([z, z + np.diag(step)])))
+                return ((beside - at) / step[:, None]).T
 
             with np.errstate(over="ignore"):  # a step too far: the next one is shorter
-                fit = least_squares(residual, full[free].copy(), method="lm", xtol=1e-8)
-            full[free] = fit.x
-            fits.append((float(fit.cost), full))
+                fit = least_squares(residual, full[free], slopes, method="lm", xtol=1e-8)
+            fits.append((float(fit.cost), laws(fit.x[None])[0]))
         return sorted(fits, key=lambda fit: fit[0])
+
+
+def _sizes(v: Float[np.ndarray, " node"], torque: Float[np.ndarray, " node"]) -> Float[np.ndarray, " param"]:
+    """Sizes of the numbers of a law by the range of its curve."""
+    top, scale = np.max(np.abs(v)), max(float(np.max(np.abs(torque))), 1e-9)
+    return np.array([scale, scale, top, scale / top, top, scale])
 
 
 def _fit_joint(
@@ -195,7 +204,8 @@ def _fit_joint(
 ) -> LawFit:
     least = (0.005 * max(float(np.max(np.abs(torque))), 1e-9)) ** 2
     cov = cov + np.diag(0.01 * np.diag(cov) + least)
-    posterior = _Posterior(v, torque, solve_triangular(np.linalg.cholesky(cov), np.eye(len(v)), lower=True))
+    whitener = solve_triangular(np.linalg.cholesky(cov), np.eye(len(v)), lower=True)
+    posterior = _Posterior(v, torque, whitener, _sizes(v, torque))
     costs, places = map(np.asarray, zip(*posterior.modes(), strict=True))
     likely, random = np.exp(costs[0] - costs), np.random.default_rng(0)
     begin = places[random.choice(len(places), 48, p=likely / likely.sum())]

@@ -22,9 +22,10 @@ demo: .venv/.demo
 test: lint docs
 	$(BIN)/pytest $(PYTEST_FLAGS) -m "not slow"
 
-# Long fits, many seeds, kill and resume of real searches. SLOW="tests/test_design.py ...": those files alone.
+# Long fits, many seeds, kill and resume of real searches, shapes and types of arguments checked, which takes a third of
+# the time. SLOW="tests/test_design.py ...": those files alone.
 test-slow: .venv/.test
-	$(BIN)/pytest $(PYTEST_FLAGS) -m slow $(SLOW)
+	$(BIN)/pytest $(PYTEST_FLAGS) --jaxtyping-packages=nnap_em,beartype.beartype -m slow $(SLOW)
 
 # Before each commit: lint, types and the tests that compile no large program.
 check: .venv/.test

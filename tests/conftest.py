@@ -80,3 +80,13 @@ def bench():
     smoother = CubatureSmoother(problem.bank)
     path = eqx.filter_jit(lambda d: jax.vmap(lambda s: smoother(model, prepare(model, s)))(d))(data).state
     return rig, model, problem.mstep, data, path
+
+
+@pytest.fixture(scope="session")
+def slide_fit():
+    """A fit of the slide of `rigs.py`."""
+    from rigs import slide_logs, slide_rig
+
+    from nnap_em.fit.identify import identify
+
+    return identify(slide_rig(), slide_logs(0), key=jax.random.key(0))

@@ -3,10 +3,10 @@
 import dataclasses
 import math
 
-import equinox as eqx
 import jax
 import numpy as np
 import pytest
+from rigs import slide_logs, slide_rig
 
 from nnap_em import diagnose, findings, identify, identify_from
 from nnap_em.commands import cli
@@ -20,28 +20,10 @@ from nnap_em.effects.position import TorsionalSpring
 from nnap_em.em.recorded import Risen, deleted, level, risen
 from nnap_em.fit.known import differences
 from nnap_em.fit.store import load, save
-from nnap_em.model.simulate import declared, examples, sweep_experiment
-from nnap_em.model.state_space import with_effects
 
 GROWN = 0.2
 """Growth of the Coulomb friction of a slide [N]; it is 1."""
-
-
-def _rig(friction: bool = True):
-    truth, _ = examples["slide"]()
-    return dataclasses.replace(declared("slide", truth), parameters={"m": Declared(1.1, 0.1)}, friction=friction)
-
-
-def _logs(seed: int, more: float = 0.0, sequences: int = 8, steps: int = 200, frictionless: bool = False, laws=()):
-    truth, sweep = examples["slide"]()
-    law = truth.unknown
-    if frictionless:
-        law = jax.tree.map(lambda a: 0 * a if a is not law.stribeck and a is not law.smooth else a, law)
-        truth = eqx.tree_at(lambda m: m.unknown, truth, law)
-    grown = eqx.tree_at(
-        lambda m: (m.unknown.coulomb, m.unknown.breakaway), truth, (law.coulomb + more, law.breakaway + more)
-    )
-    return sweep_experiment(with_effects(grown, laws), sweep, sequences, steps, key=jax.random.key(seed)).data
+LONG = {"steps": 200}
 
 
 # --- the posterior of a fit as a prior
@@ -49,8 +31,8 @@ def _logs(seed: int, more: float = 0.0, sequences: int = 8, steps: int = 200, fr
 
 def test_a_fit_from_a_fit_is_that_of_all_logs():
     """The precisions of a mass add, and its mean is weighted by them, as Bayes' rule has it."""
-    rig, first, second = _rig(friction=False), _logs(0, frictionless=True), _logs(1, frictionless=True)
-    key = jax.random.key(0)
+    rig, key = slide_rig(friction=False), jax.random.key(0)
+    first, second = (slide_logs(seed, frictionless=True) for seed in (0, 1))
     one = identify(rig, first, key=key)
     two = identify_from(one, rig, second, key=key)
     both = identify(rig, jax.tree.map(lambda *a: np.concatenate(a), first, second), key=key)
@@ -66,7 +48,7 @@ def fit_m(fit):
 
 
 def test_rigs_that_differ_are_named_key_by_key():
-    rig = _rig()
+    rig = slide_rig()
     assert differences(rig, dataclasses.replace(rig, name="another")) == []
     heavier = dataclasses.replace(rig, parameters={"m": Declared(1.3, 0.1)})
     assert differences(rig, heavier) == ["m of parameters is 1.1 ± 0.1 in the fit and 1.3 ± 0.1 here"]
@@ -80,13 +62,11 @@ def test_rigs_that_differ_are_named_key_by_key():
 
 
 @pytest.fixture(scope="module")
-def fit():
-    return identify(_rig(), _logs(0), key=jax.random.key(0))
-
-
-@pytest.fixture(scope="module")
-def closed(fit):
-    return diagnose(_rig(), _logs(1, GROWN), key=jax.random.key(0), start=fit, own=_logs(0))
+def closed():
+    """Longer recordings, which leave less room for the change."""
+    before = identify(slide_rig(), slide_logs(0, **LONG), key=jax.random.key(0))
+    new, old = slide_logs(1, GROWN, **LONG), slide_logs(0, **LONG)
+    return diagnose(slide_rig(), new, key=jax.random.key(0), start=before, own=old)
 
 
 @pytest.mark.slow  # fast: test_a_machine_that_did_not_change_is_said_to_be_the_same
@@ -104,13 +84,15 @@ def test_friction_that_grew_is_named_with_its_size(closed, tmp_path):
 @pytest.mark.slow  # fast: test_a_machine_that_did_not_change_is_said_to_be_the_same
 def test_nothing_changed_since_a_fit_that_has_a_law(closed):
     """The law of the fit is no finding, and stays."""
-    again = diagnose(_rig(), _logs(3, GROWN), key=jax.random.key(0), start=closed.after, own=_logs(1, GROWN))
+    again = diagnose(
+        slide_rig(), slide_logs(3, GROWN), key=jax.random.key(0), start=closed.after, own=slide_logs(1, GROWN)
+    )
     assert not findings(again) and changes(again, []).startswith("Nothing changed since the fit")
     assert [effect.name for effect in again.after.model.effects] == ["coulomb_change"]
 
 
-def test_a_machine_that_did_not_change_is_said_to_be_the_same(fit):
-    closed = diagnose(_rig(), _logs(2), key=jax.random.key(0), start=fit, own=_logs(0))
+def test_a_machine_that_did_not_change_is_said_to_be_the_same(slide_fit):
+    closed = diagnose(slide_rig(), slide_logs(2), key=jax.random.key(0), start=slide_fit, own=slide_logs(0))
     assert not findings(closed) and closed.risen.p_value > RISEN
     assert changes(closed, []).startswith("Nothing changed since the fit that these recordings could show: errors")
 
@@ -119,9 +101,9 @@ def test_a_machine_that_did_not_change_is_said_to_be_the_same(fit):
 def test_a_law_that_was_missing_before_is_no_change():
     """A spring that neither the rig nor the fit knows, in all recordings: 2 N/m."""
     spring, said = TorsionalSpring.of(2.0, 0.0, 0.0, 0.0, joint=1), []
-    first, second = (_logs(seed, laws=(spring,)) for seed in (0, 1))
-    before = identify(_rig(), first, key=jax.random.key(0))
-    closed = diagnose(_rig(), second, key=jax.random.key(0), start=before, own=first, log=said.append)
+    first, second = (slide_logs(seed, laws=(spring,), **LONG) for seed in (0, 1))
+    before = identify(slide_rig(), first, key=jax.random.key(0))
+    closed = diagnose(slide_rig(), second, key=jax.random.key(0), start=before, own=first, log=said.append)
     assert not findings(closed), said
     assert any("spring" in line and "missing there, and no change" in line for line in said), said
 
@@ -134,14 +116,14 @@ def test_a_law_that_the_recordings_of_the_fit_show_as_well_is_no_change():
     assert veto(**good, before=KEEP * 0.15 + 0.01).code == "before"
 
 
-def test_where_nothing_explains_it_the_errors_decide(fit):
+def test_where_nothing_explains_it_the_errors_decide(slide_fit):
     last = Step(150, (), (), None, 1, suspects=(Suspect(("payload", 1, None, ()), 0.1, 0.0),))
     for p, least, text, ending in (
         (0.9 * RISEN, 1e-3, "Something changed", "where chance removes less than 1%."),
         (1.1 * RISEN, 0.9 * RISEN, "Nothing changed", "(p = 0.011)."),
         (1.1 * RISEN, 1.1 * RISEN, "Nothing is certain to have changed", "where chance removes less than 1%."),
     ):
-        outcome = Diagnosis(fit, fit, (), (last,), change=True, risen=Risen(2.0, p, least))
+        outcome = Diagnosis(slide_fit, slide_fit, (), (last,), change=True, risen=Risen(2.0, p, least))
         sentence = changes(outcome, [])
         assert sentence.startswith(text) and sentence.endswith(ending) and "errors are 2.0 times" in sentence
     assert "not at hand" in changes(outcome._replace(risen=None), [])
@@ -187,9 +169,9 @@ def _write(folder, data, rig, names):
         write_csv(folder / "train" / f"{name}.csv", {"time": t, "u": u[:, 0], "x": y[:, 0]})
 
 
-def test_what_a_fit_cannot_begin_gets_one_line(tmp_path, capsys, fit):
-    save(tmp_path / "model.npz", fit)
-    _write(tmp_path / "logs", _logs(1, sequences=2), dataclasses.replace(_rig(), friction=False), ["0", "1"])
+def test_what_a_fit_cannot_begin_gets_one_line(tmp_path, capsys, slide_fit):
+    save(tmp_path / "model.npz", slide_fit)
+    _write(tmp_path / "logs", slide_logs(1, sequences=2), dataclasses.replace(slide_rig(), friction=False), ["0", "1"])
     arguments = [
         "diagnose",
         str(tmp_path / "logs"),

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import scipy.stats
 from helpers import nnap
+from rigs import slide_logs, slide_rig
 
 from nnap_em import compare
 from nnap_em.comparison.compare import (
@@ -30,46 +31,33 @@ from nnap_em.effects.friction import LoadFriction
 from nnap_em.errors import CompareError
 from nnap_em.fit.identify import Identified, identify
 from nnap_em.fit.store import save
-from nnap_em.model.simulate import declared, examples, sweep_experiment
 from nnap_em.report.comparison import describe, rows, table
 from nnap_em.report.tables import plain
 from nnap_em.report.wording import p_value
 
-SEQUENCES, STEPS, EPOCHS = 8, 150, 9
 GROWN = 0.25
-"""Share by which the Coulomb friction grew."""
+"""Growth of the Coulomb friction, which is 1 [N]."""
 
 
 class Fits(NamedTuple):
     """Folders of fits."""
 
     first: Path
-    """One half of a data set."""
+    """Fit of a slide."""
     second: Path
-    """The other half."""
+    """Fit of other recordings of it."""
     grown: Path
     """Fit of the same slide when its Coulomb friction had grown."""
 
 
 @pytest.fixture(scope="module")
-def fits(tmp_path_factory) -> Fits:
-    """A slide whose mass is known to 10 %, fitted three times."""
-    root, (truth, sweep) = tmp_path_factory.mktemp("compare"), examples["slide"]()
-    rig = dataclasses.replace(declared("slide", truth), parameters={"m": Declared(1.0, 0.1)})
-    more = GROWN * truth.unknown.coulomb
-    levels = truth.unknown.coulomb + more, truth.unknown.breakaway + more
-    grown = eqx.tree_at(lambda m: (m.unknown.coulomb, m.unknown.breakaway), truth, levels)
-    whole = sweep_experiment(truth, sweep, 2 * SEQUENCES, STEPS, key=jax.random.key(0)).data
-    later = sweep_experiment(grown, sweep, SEQUENCES, STEPS, key=jax.random.key(1)).data
-    parts = {
-        "first": (whole, slice(SEQUENCES)),
-        "second": (whole, slice(SEQUENCES, None)),
-        "grown": (later, slice(None)),
-    }
-    for i, (name, (data, cut)) in enumerate(parts.items()):
-        fitted = identify(rig, jax.tree.map(lambda a, cut=cut: a[cut], data), key=jax.random.key(0), epochs=EPOCHS)
-        save(root / name / "model.npz", fitted, fingerprint=f"logs {i}")
-    return Fits(*(root / name for name in parts))
+def fits(tmp_path_factory, slide_fit) -> Fits:
+    """A slide, fitted three times."""
+    root, key = tmp_path_factory.mktemp("compare"), jax.random.key(0)
+    second, grown = (identify(slide_rig(), slide_logs(seed, more), key=key) for seed, more in ((1, 0.0), (2, GROWN)))
+    for name, fitted in zip(Fits._fields, (slide_fit, second, grown), strict=True):
+        save(root / name / "model.npz", fitted, fingerprint=f"logs {name}")
+    return Fits(*(root / name for name in Fits._fields))
 
 
 @pytest.fixture(scope="module")

@@ -39,9 +39,9 @@ LIMITS = Limits(
     np.asarray([-0.4, 0.1]), np.asarray([0.3, 0.5]), np.asarray([2.0, 1e9]),
     np.asarray([-2.0, -9.0]), np.asarray([2.0, 9.0]), np.zeros(2), np.zeros(2),
 )  # fmt: skip
-SIMULATE = ("--system", "slide", "--sequences", 12, "--test", 0, "--steps", 150)
+SIMULATE = ("--system", "slide", "--sequences", 8, "--test", 0, "--steps", 95)
 SMALL = Effort(pool=16, batch=16, rounds=2, tries=4)
-THREE = {"seconds": 4.0, "sequences": 3, "effort": SMALL}
+THREE = {"seconds": 2.4, "sequences": 3, "effort": SMALL}
 
 
 @pytest.mark.parametrize("family", range(len(FAMILIES)), ids=[type(f).__name__ for f in FAMILIES])
@@ -164,7 +164,7 @@ def test_what_is_promised_is_what_a_fit_then_states_and_the_truth_is_near(slide)
     """The design is played by the model that made the logs, with noise of its own."""
     _, rig, data, fitted = slide
     truth = nnap_em.paper.examples["slide"]().model
-    plan = {"question": "m", "seconds": 6.0, "sequences": 4, "effort": SMALL}
+    plan = {"question": "m", "seconds": 3.8, "sequences": 4, "effort": SMALL}
     designed = design(fitted, data, key=jax.random.key(1), **plan)
     made = nnap_em.simulate(truth, jnp.asarray(designed.start), jnp.asarray(designed.u), key=jax.random.key(9)).data
     both = Dataset(*(np.concatenate([a, b]) for a, b in zip(data, made, strict=True)))
@@ -175,9 +175,14 @@ def test_what_is_promised_is_what_a_fit_then_states_and_the_truth_is_near(slide)
     assert max(std(designed.expected), std(designed.old)) < std(designed.nothing)
 
 
-def test_no_motion_of_a_design_leaves_what_the_logs_visited(slide):
+@pytest.fixture(scope="module")
+def plan(slide):
     *_, data, fitted = slide
-    designed = design(fitted, data, key=jax.random.key(2), **THREE)
+    return design(fitted, data, key=jax.random.key(2), **THREE)
+
+
+def test_no_motion_of_a_design_leaves_what_the_logs_visited(slide, plan):
+    (*_, data, fitted), designed = slide, plan
     paths = drawn_paths(fitted, 300, key=jax.random.key(77))
     extremes = motions(paths, designed.limits, designed.t, designed.u, designed.start, 1, key=jax.random.key(78))
     assert np.all(np.asarray(extremes.lowest) >= designed.limits.lowest[None, None])
@@ -189,9 +194,8 @@ def test_no_motion_of_a_design_leaves_what_the_logs_visited(slide):
     assert (
         speed[near > 0].max() <= designed.slow[0] < speed[whole > 0].max()
     )  # the slowest rows once more by themselves
-    again, other = (design(fitted, data, key=jax.random.key(seed), **THREE) for seed in (2, 3))
+    again = design(fitted, data, key=jax.random.key(2), **THREE)
     np.testing.assert_array_equal(designed.u, again.u)  # the same seed, the same numbers
-    assert not np.array_equal(designed.u, other.u)
 
 
 def test_a_motion_is_allowed_that_stays_inside_its_limits_by_more_than_its_spread():
@@ -208,8 +212,8 @@ def test_a_motion_is_allowed_that_stays_inside_its_limits_by_more_than_its_sprea
 
 def test_declared_limits_hold_and_wrong_ones_are_told(slide):
     _, rig, data, fitted = slide
-    path, used, system = np.zeros((12, 151, 2)), np.ones(12, bool), fitted.model.system
-    path[:, :, 0] = np.linspace(-0.1, 0.2, 151)
+    path, used, system = np.zeros((8, 96, 2)), np.ones(8, bool), fitted.model.system
+    path[:, :, 0] = np.linspace(-0.1, 0.2, 96)
     bounded = lambda **tables: dataclasses.replace(rig, limits=Bounds(**tables))  # noqa: E731
     plain = limits_of(rig, system, data, path, used)
     assert plain.low[0] == np.asarray(data.u).min() and plain.high[0] == np.asarray(data.u).max()
@@ -225,7 +229,7 @@ def test_declared_limits_hold_and_wrong_ones_are_told(slide):
         limits_of(rig, system, data._replace(u=np.zeros_like(data.u)), path, used)
     tight = fitted._replace(rig=bounded(values={"x": (-1e-4, 1e-4)}))
     with pytest.raises(DesignError, match=r"stay inside the limits; widen \[limits\]"):
-        design(tight, data, key=jax.random.key(0), seconds=4.0, sequences=2, effort=SMALL)
+        design(tight, data, key=jax.random.key(0), **THREE)
 
 
 @pytest.mark.parametrize(
@@ -281,7 +285,7 @@ def test_old_and_new_logs_are_fitted_together(slide, designed, tmp_path, capsys,
     monkeypatch.chdir(folder)
     assert nnap("identify", ".", "--more", os.path.relpath(new, folder), "--out", out, "--epochs", 2, "--quiet") == 0
     monkeypatch.chdir(tmp_path)
-    assert "to 24 sequences" in json.loads((out / "report.json").read_text())["verdict"]
+    assert "to 16 sequences" in json.loads((out / "report.json").read_text())["verdict"]
     from nnap_em.fit.store import read
 
     assert read(out / "model.npz").notes["logs"] == [str(folder), str(new)]
@@ -334,10 +338,9 @@ def test_wrong_limits_are_refused(slide, tmp_path, lines, reason):
         read_rig(path, specs)
 
 
-def test_the_figure_shows_all_of_every_input(slide):
+def test_the_figure_shows_all_of_every_input(slide, plan):
     """Rows share their axis: a sequence that hardly moves, at the end, hides nothing of the first."""
-    *_, data, fitted = slide
-    designed = design(fitted, data, key=jax.random.key(2), **THREE)
-    u = np.broadcast_to(np.asarray([3.0, 1.0, 0.01])[:, None, None], designed.u.shape)
-    low, high = motion_figure(designed._replace(u=u), names_of(fitted), range(3)).axes[0].get_ylim()
+    fitted = slide[-1]
+    u = np.broadcast_to(np.asarray([3.0, 1.0, 0.01])[:, None, None], plan.u.shape)
+    low, high = motion_figure(plan._replace(u=u), names_of(fitted), range(3)).axes[0].get_ylim()
     assert low < 0.01 and high > 3.0

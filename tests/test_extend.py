@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import rod
+from rigs import slide_logs
 
 from nnap_em.diagnosis.context import SEARCH_EFFORT, SearchContext, extend
 from nnap_em.diagnosis.hypothesis import Hypothesis
@@ -21,11 +22,11 @@ def fitted(tmp_path_factory):
     return identify(rod.rig(tmp_path_factory.mktemp("rod"), pendulum=True), data, key=jax.random.key(0)), data
 
 
-def _extended(fitted, model):
+def _extended(before, data, model):
     """A fit that goes on from `model`, and what it logs."""
-    (before, data), lines = fitted, []
+    lines = []
     context = SearchContext(before, {}, data, MultiStep(), SEARCH_EFFORT, lines.append)
-    return extend(context, Hypothesis(model, before.m_step), rod.ROWS), lines
+    return extend(context, Hypothesis(model, before.m_step), data.t.shape[1]), lines
 
 
 @pytest.mark.slow  # fast: test_friction_that_is_right_is_gone_on_from
@@ -34,7 +35,7 @@ def test_friction_too_steep_for_the_integration_is_left(fitted):
 
     It is that of `identify`: the same network, noise and schedule.
     """
-    before, _ = fitted
+    before, data = fitted
     weights = before.m_step.weights(before.model)
     w = weights.read(before.model)
     phi = weights.phi(before.model.unknown, w)
@@ -42,7 +43,7 @@ def test_friction_too_steep_for_the_integration_is_left(fitted):
     precise = 1e4 * jnp.eye(phi.size)
     model = weights.write(before.model, weights.fit(before.model.unknown, w, precise @ steep, precise, 500))
     assert abs(float(model.unknown(jnp.ones(1))[0])) > 100
-    state, lines = _extended(fitted, eqx.tree_at(lambda m: m.log_q, model, model.log_q + 8))
+    state, lines = _extended(before, data, eqx.tree_at(lambda m: m.log_q, model, model.log_q + 8))
     assert any("friction as declared is the likelier start" in line for line in lines)
     np.testing.assert_allclose(state.top, before.state.top, rtol=1e-9)
     v = np.array([[-4.0, -1.0, -0.3, 0.3, 1.0, 4.0]])
@@ -50,11 +51,10 @@ def test_friction_too_steep_for_the_integration_is_left(fitted):
     np.testing.assert_allclose(table.torque, -0.05 * v - 0.1 * np.tanh(v / 0.1), atol=0.01)
 
 
-def test_friction_that_is_right_is_gone_on_from(fitted):
-    before, _ = fitted
-    state, lines = _extended(fitted, before.model)
+def test_friction_that_is_right_is_gone_on_from(slide_fit):
+    state, lines = _extended(slide_fit, slide_logs(0), slide_fit.model)
     assert len(lines) == 1
-    assert np.nanmean(state.top) == pytest.approx(np.nanmean(before.state.top), abs=0.5)
+    assert np.nanmean(state.top) == pytest.approx(np.nanmean(slide_fit.state.top), abs=0.5)
 
 
 @pytest.mark.parametrize("hold", [1, 2, 3])

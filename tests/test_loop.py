@@ -17,7 +17,7 @@ from nnap_em.effects.base import Curve
 from nnap_em.effects.function import Axis
 from nnap_em.numerics.profile import profiling
 
-SLIDE = plant.Case(system="slide", sequences=8, tests=3, steps=250, seed=2, noise=(5e-4, 5e-3))
+SLIDE = plant.Case(system="slide", sequences=8, tests=3, steps=95, seed=2, noise=(5e-4, 5e-3))
 SPRING = {"name": "torsional_spring", "joint": 1, "k": 20.0, "theta0": 0.05}
 DRAG = {"name": "air_drag", "joint": 1, "c": 0.8}
 
@@ -30,33 +30,24 @@ def _closed(case, folder):
     return diagnosis, findings(diagnosis)
 
 
-def test_a_slide_that_lacks_nothing_is_left_alone(tmp_path):
+def test_a_slide_that_lacks_nothing_is_left_alone_and_other_recordings_of_it_compile_nothing(tmp_path):
     """A drag of the joint's own velocity is a static map: the learned friction holds it, and nothing is missing.
 
-    The same seed gives the same numbers.
+    The programs of its search serve another data set, of two recordings more and three rows less.
     """
     case = SLIDE._replace(effects=(DRAG,))
-    first, lacking = _closed(case, tmp_path)
+    diagnosis, lacking = _closed(case, tmp_path / "first")
     assert not lacking
-    assert first.after is first.before
-    again, _ = _closed(case, tmp_path)
-    for a, b in zip(jax.tree.leaves(first.after.model), jax.tree.leaves(again.after.model), strict=True):
-        np.testing.assert_array_equal(a, b)
-
-
-def test_other_recordings_of_the_machine_compile_nothing(tmp_path):
-    """The programs of a search serve another data set, of two recordings more and three rows less."""
-    case = SLIDE._replace(effects=(DRAG,))
-    _closed(case, tmp_path / "first")
+    assert diagnosis.after is diagnosis.before
     with profiling() as profile:
-        _closed(case._replace(sequences=10, steps=247, seed=3), tmp_path / "second")
+        _closed(case._replace(sequences=10, steps=92, seed=3), tmp_path / "second")
     assert {name: stages for name, stages in profile.spent.items() if stages["compile"]} == {}
 
 
-@pytest.mark.slow  # fast: test_other_recordings_of_the_machine_compile_nothing
+@pytest.mark.slow  # fast: test_a_slide_that_lacks_nothing_is_left_alone_and_other_recordings_of_it_compile_nothing
 def test_a_spring_of_a_slide_through_the_command(tmp_path):
     """Named and sized; the report exact to the interface; the reported errors those of `predict`."""
-    plant.write(SLIDE._replace(effects=(SPRING, DRAG)), tmp_path / "rig")
+    plant.write(SLIDE._replace(steps=250, effects=(SPRING, DRAG)), tmp_path / "rig")
     out = tmp_path / "found"
     assert cli.main(["diagnose", str(tmp_path / "rig"), "--out", str(out), "--quiet"]) == 0
     report = json.loads((out / "report.json").read_text())

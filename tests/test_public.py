@@ -24,7 +24,7 @@ FUNCTIONS = {
 def names(tmp_path_factory):
     """A slide with its logs, and a fit of three epochs."""
     folder = tmp_path_factory.mktemp("public") / "bench"
-    assert main(["simulate", str(folder), "--system", "slide", "--sequences", "2", "--test", "1", "--steps", "60"]) == 0
+    assert main(["simulate", str(folder), "--system", "slide", "--sequences", "4", "--test", "1", "--steps", "95"]) == 0
     rig, key = nnap_em.read_rig(folder / "rig.toml"), jax.random.key(0)
     logs, test = (nnap_em.read_logs(folder / part, rig) for part in ("train", "test"))
     fits = [nnap_em.identify(rig, logs.data, key=jax.random.key(seed), epochs=3) for seed in (0, 1)]

@@ -97,7 +97,7 @@ def read_logs(folder: Path | str, rig: Rig, *, trust: bool = False, until: float
 
     Example:
         >>> nnap_em.read_logs(f"{folder}/train", rig).data.y.shape
-        (2, 61, 1)
+        (4, 96, 1)
     """
     files = [Path(folder)] if Path(folder).is_file() else log_files(Path(folder))
     tables = [_read_table(path, rig) for path in files]

@@ -116,7 +116,10 @@ def play(
 ) -> Played:
     """A log through a written observer; `u` are the inputs held from the row before, `options` those of gcc."""
     out = "".join([source.stem, *options, ".so"])
-    library = ctypes.CDLL(str(compiled(source, LOOP, out, "-shared", "-fPIC", *options)))
+    path = source.with_name(out)
+    if not path.exists() or path.stat().st_mtime_ns < source.stat().st_mtime_ns:
+        path = compiled(source, LOOP, out, "-shared", "-fPIC", *options)
+    library = ctypes.CDLL(str(path))
     rows = len(t)
     mean, cov, innovation = (np.zeros(s, kind) for s in ((rows, states), (rows, states, states), np.shape(y)))
     flags = np.zeros(rows, np.int32)

@@ -11,14 +11,18 @@ import numpy as np
 import plant
 
 from nnap_em.commands import cli
+from nnap_em.data.dataset import Dataset
 from nnap_em.data.rig import Rig, read_rig, write_rig
 from nnap_em.diagnosis.residual import Residual
 from nnap_em.effects.base import SearchScales
+from nnap_em.em.build import build_system
 from nnap_em.em.mstep import ScoringMStep
 from nnap_em.em.prior import ParameterPrior
+from nnap_em.em.servos import build_servos
+from nnap_em.fit.identify import Identified, begin
 from nnap_em.model.friction import FixedFriction, NoFriction
 from nnap_em.model.law import StribeckLaw
-from nnap_em.model.state_space import StateSpaceModel
+from nnap_em.model.state_space import StateSpaceModel, with_effects
 from nnap_em.numerics.gaussian import Gaussian
 from nnap_em.systems import specs, systems
 from nnap_em.systems.slide import Slide
@@ -50,6 +54,13 @@ def data_sets(shared: Path) -> list[Path]:
     """The rig.toml of every shared data set without a fault; one with a fault has an expected.txt."""
     paths = sorted((shared / "data").glob("*/*/rig.toml"))
     return [path for path in paths if (path.parent / "train").is_dir() and not path.with_name("expected.txt").exists()]
+
+
+def begun(rig: Rig, data: Dataset) -> Identified:
+    """A fit that no epoch has changed, as certain of every weight."""
+    fitted = begin(rig, data, key=jax.random.key(0))
+    information = 1e3 * jnp.eye(fitted.state.hessian.shape[0])
+    return fitted._replace(state=fitted.state._replace(hessian=information, loglik=jnp.zeros(1)))
 
 
 def swing_rig(**changes) -> Rig:
@@ -179,3 +190,13 @@ k = { mean = 1.0, std = 0.3 }
 ta = { mean = 4.0, std = 1.0 }
 """
     return rig_text(model + unknown, f"{{ {columns} }}", 0.5)
+
+
+def servo_model(rig: Rig, effects=()) -> StateSpaceModel:
+    """The machine with its servos, without friction."""
+    system = build_system(rig)
+    states, read = 2 * len(system.coordinates), tuple(range(len(rig.measured)))
+    start, servos = Gaussian(jnp.zeros(states), jnp.eye(states)), build_servos(rig) or None
+    none = NoFriction(jnp.ones(states // 2))
+    model = StateSpaceModel(system, none, start, jnp.zeros(states), jnp.zeros(len(read)), read, rig.dt, servos=servos)
+    return with_effects(model, effects)

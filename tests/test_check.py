@@ -9,13 +9,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import file_rig, nnap
+from helpers import slide as slide_model
 
 from nnap_em.data.dataset import Dataset
 from nnap_em.data.logs import REPEAT, Logs, Masked
 from nnap_em.data.rig import Declared, Rig, RigError, read_rig
 from nnap_em.em.build import build_system, measure_scales
 from nnap_em.fit import check as check_module
-from nnap_em.fit.check import CheckResult, check, gramian, torques, undetermined
+from nnap_em.fit.check import Along, CheckResult, check, gramian, torques, undetermined
+from nnap_em.fit.check import _observability as observability
+from nnap_em.fit.check import _sampling as sampling
 from nnap_em.model.simulate import examples, sweep_experiment
 from nnap_em.systems import specs
 from nnap_em.systems.acrobot import table_i
@@ -57,18 +60,8 @@ def _changed(logs: Logs, **parts) -> Logs:
 def test_a_good_data_set_is_all_ok(slide):
     report = _report(slide, test=slide)
     assert {mark for answers in report.values() for mark, _ in answers} == {"ok"}
-    assert list(report) == [
-        "length",
-        "test",
-        "missing",
-        "rate",
-        "sampling",
-        "noise",
-        "torque",
-        "dynamics",
-        "motion",
-        "states",
-    ]
+    subjects = "length test missing rate sampling noise torque dynamics motion states"
+    assert list(report) == subjects.split()
     assert f"{COUNT} training sequences, 12.1 s, {COUNT * ROWS} rows" in report["length"][0][1]
     assert "2 of 2 directions" in report["states"][0][1]
 
@@ -142,13 +135,16 @@ def test_a_sum_of_states_read_exactly_determines_neither(size):
     np.testing.assert_allclose(left, np.sqrt(0.5 + 0.5 / (1 + 2 * size)), rtol=1e-7)
 
 
-def test_a_place_that_nothing_tells_is_named(slide):
+def test_a_place_that_nothing_tells_is_named():
     """A slide knows no place: its rate tells nothing of it, and friction does not mind."""
-    report = _report(_changed(slide, y=lambda y: y[..., 1:]), _rig(("dx",)))
-    ((mark, text),) = report["states"]
-    assert mark == "warning"
-    assert "1 of 2 directions" in text
-    assert "not determined: x" in text
+    turn = np.broadcast_to([[1.0, 0.01], [0.0, 1.0]], (1, 101, 2, 2))
+    along = Along(
+        np.random.default_rng(0).normal(size=(1, 101, 2)), turn, np.broadcast_to([[0.0, 1.0]], (1, 101, 1, 2))
+    )
+    model = replace(slide_model()[0], dt=0.01, measured=(1,), log_r=jnp.log(jnp.full(1, 2.5e-5)))
+    (finding,) = observability(model, along, np.ones((1, 101), bool))
+    assert finding.mark == "warning"
+    assert "1 of 2 directions" in finding.text and "not determined: x" in finding.text
 
 
 def test_readings_that_tell_no_velocity_are_bad(slide):
@@ -160,48 +156,45 @@ def test_readings_that_tell_no_velocity_are_bad(slide):
 
 
 ROW = np.arange(ROWS)
-CASES = {  # the words of the check, then name: change
-    "length | error | too few": dict(valid=lambda v: v & (ROW < 15)),
-    "length | warning | 0.5 s": dict(valid=lambda v: v & (ROW < 50)),
-    "missing | warning | x: 67 %": dict(y=lambda y: np.where((ROW % 3 > 0)[None, :, None], np.nan, y)),
-    "missing | error | x: 80 %": dict(y=lambda y: np.where((ROW % 20 > 3)[None, :, None], np.nan, y)),
-    "torque | error | look at its unit (N)": dict(u=lambda u: 1000 * u),
-    "torque | error | its unit (N)": dict(u=lambda u: u / 1e5),
-    "motion | warning | one direction only": dict(y=lambda y: np.stack([y[..., 0], np.abs(y[..., 1])], -1)),
-    "motion | error | hardly moves": dict(y=lambda y: np.stack([y[..., 0], 0.01 * y[..., 1]], -1)),
-    "motion | warning | it rests most of the time": dict(y=lambda y: y * np.where(ROW < 20, 1.0, 1e-3)[None, :, None]),
-    "noise | warning | declare more": dict(
-        y=lambda y: y + np.random.default_rng(1).normal(size=y.shape) * [0.01, 0.0],
-    ),
-    "noise | warning | was filtered": dict(rig=_rig(noise={"x": 1e-3, "dx": 0.1})),
+CASES = {  # the words of the check: the change of the readings, of another part of the logs, or of the rig
+    "length | error | too few": {"valid": lambda v: v & (ROW < 15)},
+    "length | warning | 0.5 s": {"valid": lambda v: v & (ROW < 50)},
+    "missing | warning | x: 67 %": lambda y: np.where((ROW % 3 > 0)[None, :, None], np.nan, y),
+    "missing | error | x: 80 %": lambda y: np.where((ROW % 20 > 3)[None, :, None], np.nan, y),
+    "torque | error | look at its unit (N)": {"u": lambda u: 1000 * u},
+    "torque | error | its unit (N)": {"u": lambda u: u / 1e5},
+    "motion | warning | one direction only": lambda y: np.stack([y[..., 0], np.abs(y[..., 1])], -1),
+    "motion | error | hardly moves": lambda y: np.stack([y[..., 0], 0.01 * y[..., 1]], -1),
+    "motion | warning | it rests most of the time": lambda y: y * np.where(ROW < 20, 1.0, 1e-3)[None, :, None],
+    "noise | warning | declare more": lambda y: y + np.random.default_rng(1).normal(size=y.shape) * [0.01, 0.0],
+    "noise | warning | was filtered": {"rig": _rig(noise={"x": 1e-3, "dx": 0.1})},
 }
 
 
 @pytest.mark.parametrize("words", CASES)
 def test_what_is_bad_is_found(slide, words):
-    (subject, mark, text), change = words.split(" | "), {"rig": None} | CASES[words]
-    rig = change.pop("rig")
+    (subject, mark, text), change = words.split(" | "), CASES[words]
+    change = {"y": change} if callable(change) else dict(change)
+    rig = change.pop("rig", None)
     answers = _report(_changed(slide, **change), rig)[subject]
     assert any(actual == mark and text in said for actual, said in answers), answers
 
 
 def test_with_hardly_any_rows_nothing_else_is_asked(slide):
     report = _report(_logs(Dataset(*(part[:, :2] for part in slide.data))))
-    assert list(report) == ["length", "test", "missing"]
-    assert report["length"][0][0] == "error"
+    assert list(report) == ["length", "test", "missing"] and report["length"][0][0] == "error"
 
 
 def test_slow_sampling_is_noticed(slide):
     """Every 10th row: half a second of a sweep is five rows."""
-    slow = Dataset(*(part[:, ::10] for part in slide.data))
-    report = _report(_logs(slow), _rig(dt=0.1))
-    assert report["sampling"][0][0] == "warning"
-    assert "sample faster" in report["sampling"][0][1]
+    rig, slow = _rig(dt=0.1), Dataset(*(part[:, ::10] for part in slide.data))
+    still = Along(*(np.zeros((1, 11, *shape)) for shape in ((2,), (2, 2), (2, 2), (2, 2))))
+    (finding,) = sampling(rig, still, measure_scales(rig, build_system(rig), slow))
+    assert finding.mark == "warning" and "sample faster" in finding.text
 
 
-@pytest.mark.parametrize("slower", (100.0, 6000.0))
-def test_a_slow_machine_is_judged_as_a_quick_one(slide, slower):
-    """The same motion in so many times as long a unit of time, 1 s or 60 s a sample: nothing changes."""
+def test_a_slow_machine_is_judged_as_a_quick_one(slide, slower=6000.0):
+    """The same motion in so many times as long a unit of time, 60 s a sample: nothing changes."""
     slow = _changed(slide, t=lambda t: slower * t, u=lambda u: u / slower**2, y=lambda y: y / [1.0, slower])
     noise = {"x": 1e-3, "dx": 5e-3 / slower}
     quick_scales, scales = (
@@ -248,7 +241,7 @@ def test_a_held_reading_is_said_and_its_repeats_are_no_lost_samples(slide):
 
 def test_the_command_prints_a_line_per_question_and_fails_where_one_is_bad(tmp_path, capsys):
     folder = tmp_path / "bench"
-    assert nnap("simulate", folder, "--system", "slide", "--sequences", 4, "--test", 1, "--steps", 150) == 0
+    assert nnap("simulate", folder, "--system", "slide", "--sequences", COUNT, "--test", 1, "--steps", ROWS - 1) == 0
     before = sorted(tmp_path.rglob("*"))
     capsys.readouterr()
     assert nnap("check", folder) == 0
@@ -261,7 +254,7 @@ def test_the_command_prints_a_line_per_question_and_fails_where_one_is_bad(tmp_p
     assert nnap("check", folder) == 1
     bad = capsys.readouterr()
     assert "nnap-em: 2 errors" in bad.err
-    assert re.search(r"(?m)^error    dynamics    u is in another unit: multiply it by 1e\+06 ", bad.out)
+    assert re.search(r"(?m)^error    dynamics    u is in another unit: multiply it by 9.91e\+05 ", bad.out)
     assert re.search(r"(?m)^error    torque      u: up to .* look at its unit", bad.out)
     assert sorted(tmp_path.rglob("*")) == before
 

@@ -119,13 +119,13 @@ def test_which_times_are_of_one_clock(t, count):
     assert (None if kept is None else kept.size) == count
 
 
-@pytest.mark.parametrize("wrong", [clock.RUNS // 2 - 1, clock.RUNS // 2])
-def test_more_wrong_stretches_than_are_looked_at_are_refused(wrong):
+def test_more_wrong_stretches_than_are_looked_at_are_refused():
     """Every wrong time is a stretch, and what follows it another."""
-    t = np.arange(50_000) * NS // 100
-    t[np.arange(1, wrong + 1) * 20] += 10**6 * NS
-    kept = clock.trusted(t)
-    assert (None if kept is None else t.size - kept.size) == (wrong if 2 * wrong < clock.RUNS else None)
+    for wrong, dropped in ((clock.RUNS // 2 - 1, clock.RUNS // 2 - 1), (clock.RUNS // 2, None)):
+        t = np.arange(50_000) * NS // 100
+        t[np.arange(1, wrong + 1) * 20] += 10**6 * NS
+        kept = clock.trusted(t)
+        assert (None if kept is None else t.size - kept.size) == dropped
 
 
 def test_small_steps_back_in_a_table_are_sorted_and_larger_ones_refused(tmp_path):
@@ -156,21 +156,25 @@ def test_rows_of_one_stamp_keep_all_their_columns(tmp_path):
 UNITS = {"s": 1, "ms": 10**3, "us": 10**6, "ns": 10**9}
 
 
+def _table(path, name: str, time, columns):
+    """A log of this suffix, whose times are numbers or texts."""
+    if path.suffix == ".csv":
+        return _csv(path, time, columns, name)
+    if path.suffix == ".h5":
+        return write_hdf5(path, {"arm": {name: np.array(time, "S") if isinstance(time, list) else time} | columns})
+    pq.write_table(pa.table({name: time} | columns), path)
+    return path
+
+
 @pytest.mark.parametrize("unit", UNITS)
 @pytest.mark.parametrize("kind", ["csv", "h5", "parquet"])
 def test_stamps_since_1970_are_read_by_their_size(tmp_path, kind, unit):
     """Whole numbers, and in a table those of a float; of milliseconds as they are in seconds."""
     stamps = (ns(T) // 10**6) * (UNITS[unit] // 10**3) if unit != "s" else 1.7e9 + T
-    columns, path = _columns(T), tmp_path / f"a.{kind}"
-    if kind == "csv":
-        _csv(path, stamps, columns, "timestamp")
-    elif kind == "h5":
-        write_hdf5(path, {"arm": {"timestamp": stamps} | columns})
-    else:
-        pq.write_table(pa.table({"timestamp": stamps} | columns), path)
+    path = _table(tmp_path / f"a.{kind}", "timestamp", stamps, _columns(T))
     (track,) = reader(path).read(path, {"/arm" if kind == "h5" else "": ("u",)}).tracks.values()
     np.testing.assert_allclose(track.t - EPOCH, ns(T) - EPOCH, atol=300)  # ns: a float64 of 1.7e9 s holds 240
-    np.testing.assert_allclose(_import(path).values[0]["u"], columns["u"], rtol=1e-12)
+    np.testing.assert_allclose(_import(path).values[0]["u"], np.cos(T), rtol=1e-12)
 
 
 SIZES = {  # numbers, the unit by the name, and ns of the first or words of the refusal
@@ -195,10 +199,10 @@ def test_times_are_of_the_unit_that_their_name_or_size_shows(tmp_path, number, u
                 clock.nanoseconds(tmp_path, "times", t, unit)
 
 
-@pytest.mark.parametrize("unit, scale", [("ms", 1e3), ("us", 1e6), ("days", 1 / DAY)])
-def test_a_unit_that_is_not_named_is_refused_with_it(tmp_path, unit, scale):
-    with pytest.raises(DataError, match=f"in {unit}: write s"):
-        _import(_csv(tmp_path / "a.csv", scale * T, _columns(T)))
+def test_a_unit_that_is_not_named_is_refused_with_it(tmp_path):
+    for unit, scale in (("ms", 1e3), ("us", 1e6), ("days", 1 / DAY)):
+        with pytest.raises(DataError, match=f"in {unit}: write s"):
+            _import(_csv(tmp_path / "a.csv", scale * T, _columns(T)))
 
 
 DATES = {
@@ -217,26 +221,24 @@ DATES = {
 }
 
 
-@pytest.mark.parametrize("text, moment", DATES.items())
-def test_dates_and_times_of_day_are_seconds(text, moment):
-    assert dates.moments([text])[0] == pytest.approx(moment, abs=1e-6)  # a step of 64 bits since 1970 is 2.4e-7 s
+def test_dates_and_times_of_day_are_seconds():
+    for text, moment in DATES.items():  # a step of 64 bits since 1970 is 2.4e-7 s
+        assert dates.moments([text])[0] == pytest.approx(moment, abs=1e-6), text
 
 
-@pytest.mark.parametrize("kind", ["csv", "texts", "h5", "dates", "durations"])
-def test_times_as_dates_give_the_rows_of_times_in_seconds(tmp_path, kind):
-    texts = [datetime.fromtimestamp(s, UTC).isoformat() for s in (ns(T) * 1e-9).tolist()]
-    columns, path = _columns(T), tmp_path / ("a.csv" if kind == "csv" else "a.h5" if kind == "h5" else "a.parquet")
-    if kind == "csv":
-        _csv(path, texts, columns)
-    elif kind == "h5":
-        write_hdf5(path, {"arm": {"time": np.array(texts, "S")} | columns})
-    else:
-        durations = pa.array(ns(T) - EPOCH, pa.duration("ns"))
-        of = {"texts": texts, "dates": pa.array(ns(T), pa.timestamp("ns")), "durations": durations}
-        pq.write_table(pa.table({"time": of[kind]} | columns), path)
-    log = _import(path)
-    np.testing.assert_allclose(log.values[0]["u"], columns["u"], rtol=1e-12)
-    np.testing.assert_allclose(log.values[0]["theta1"], columns["theta1"], atol=3 * 1e-6)  # 3 rad/s, dates are in us
+TEXTS = [datetime.fromtimestamp(s, UTC).isoformat() for s in (ns(T) * 1e-9).tolist()]
+TIMES = {  # suffix, and times as dates
+    "csv": ("csv", TEXTS), "texts": ("parquet", TEXTS), "h5": ("h5", TEXTS),
+    "dates": ("parquet", pa.array(ns(T), pa.timestamp("ns"))),
+    "durations": ("parquet", pa.array(ns(T) - EPOCH, pa.duration("ns"))),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("suffix, times", TIMES.values(), ids=TIMES)
+def test_times_as_dates_give_the_rows_of_times_in_seconds(tmp_path, suffix, times):
+    log = _import(_table(tmp_path / f"a.{suffix}", "time", times, _columns(T)))
+    np.testing.assert_allclose(log.values[0]["u"], np.cos(T), rtol=1e-12)
+    np.testing.assert_allclose(log.values[0]["theta1"], np.sin(3 * T), atol=3 * 1e-6)  # 3 rad/s, dates are in us
 
 
 def test_a_text_that_is_no_date_is_named_with_its_line(tmp_path):
@@ -259,10 +261,10 @@ def test_a_csv_file_in_blocks_is_the_same_and_of_any_size(tmp_path, monkeypatch,
     with pytest.raises(DataError, match="too much for one sequence"):
         formats.read_table(path, ("time",), ("u",))
     lines = path.read_text().split("\n")
-    for row, text, words in ((700, "1,2,3", "line 701: found 3 fields"), (800, "1,2,x,3", "line 801, column 'theta1'"),
-                             (900, "", "line 901: found 1 field")):  # fmt: skip
-        path.write_text("\n".join([*lines[:row], text, *lines[row + 1 :]]))
-        with pytest.raises(DataError, match=words):
+    words = {"1,2,3": "line 701: found 3 fields", "1,2,x,3": "line 701, column 'theta1'", "": "line 701: found 1 field"}
+    for text, said in words.items():
+        path.write_text("\n".join([*lines[:700], text, *lines[701:]]))
+        with pytest.raises(DataError, match=said):
             formats.read_log(path, ("time",), ("theta1", "u"))
 
 
@@ -290,23 +292,16 @@ def test_two_clocks_of_a_log_are_taken_out_or_reported(tmp_path, offset, note):
         np.testing.assert_allclose(log.values[0]["theta1"], np.sin(3 * T), atol=3e-6)  # 3 rad/s, to 1 us
 
 
-def test_a_header_clock_that_drifts_is_taken_out(tmp_path):
+def test_a_header_clock_that_drifts_is_taken_out_and_one_that_was_set_is_not_taken(tmp_path):
     """2000 ppm: 20 ms in 10 s; straight lines through 20 medians leave half a part, 0.5 ms, at each end."""
     log = _import(_mcap(tmp_path / "a.mcap", ns(T), ns(1.002 * T), T, np.cos(T)))
     assert "taken out" in _notes(log)
     first = log.sequences[0].start
     np.testing.assert_allclose(log.values[0]["theta1"], np.sin(3 * (first + DT * np.arange(_rows(log)[0]))), atol=3e-3)
-
-
-def test_a_header_clock_that_was_set_is_not_taken(tmp_path):
     log = _import(_mcap(tmp_path / "a.mcap", ns(T), ns(T + 5 * (T > 5)), T, np.cos(T)))
     assert "header stamps were set within the log: log times are taken" in _notes(log) and _rows(log) == [1000]
-
-
-def test_a_shift_that_was_given_is_not_proposed_again(tmp_path):
     path = _mcap(tmp_path / "a.mcap", ns(T), ns(T - 0.1), T, np.cos(T))
-    assert "--shift" in _notes(_import(path))
-    assert not _notes(_import(path, shifts={"/js": 0.1}))
+    assert "--shift" in _notes(_import(path)) and not _notes(_import(path, shifts={"/js": 0.1}))  # as it was given
 
 
 def test_groups_whose_times_have_different_names_are_pointed_out(tmp_path):
@@ -323,16 +318,13 @@ def _sent(t, values, tmp_path, more: str = "") -> Resampled:
     return _import(_mcap(tmp_path / "a.mcap", ns(T), ns(T), np.array(t, float), np.array(values, float)), more)
 
 
-@pytest.mark.parametrize("more", ["", "gap = 0.1", 'input = "mean"'])
-def test_commands_on_change_hold_to_the_end(tmp_path, more):
-    log = _sent([2.0, 2.3, 7.0], [0.4, -0.3, 0.2], tmp_path, more)
-    assert _rows(log) == [800] and "u is sent on change (3 values, no rate)" in _notes(log)
-    expected = np.repeat([0.4, -0.3, 0.2], [30, 470, 300])
-    np.testing.assert_allclose(log.values[0]["u"], expected, atol=1e-6)  # stamps are in ns
-
-
-def test_one_command_is_enough(tmp_path):
-    log = _sent([2.0], [0.4], tmp_path)
+def test_commands_on_change_hold_to_the_end(tmp_path):
+    for more in ("", "gap = 0.1", 'input = "mean"'):
+        log = _sent([2.0, 2.3, 7.0], [0.4, -0.3, 0.2], tmp_path, more)
+        assert _rows(log) == [800] and "u is sent on change (3 values, no rate)" in _notes(log)
+        expected = np.repeat([0.4, -0.3, 0.2], [30, 470, 300])
+        np.testing.assert_allclose(log.values[0]["u"], expected, atol=1e-6)  # stamps are in ns
+    log = _sent([2.0], [0.4], tmp_path)  # one command is enough
     assert _rows(log) == [800] and set(log.values[0]["u"]) == {0.4}
 
 
@@ -367,15 +359,15 @@ CHANGE = {  # times and values of commands, and whether each holds until the nex
 }
 
 
-@pytest.mark.parametrize("t, y, on_change", CHANGE.values(), ids=CHANGE)
-def test_commands_sent_on_change_are_known_by_their_times_and_values(t, y, on_change):
-    assert sent_on_change(Signal("", t, y[: t.size]), DT) == on_change
+CHANGE = {name: (t, y[: t.size], DT, holds) for name, (t, y, holds) in CHANGE.items()} | {
+    f"every 15 s, {dt} s a row": (15.0 * np.arange(240.0), np.tile([0.0, 40.0], 120), dt, holds)
+    for dt, holds in ((15.0, False), (0.1, True))  # a value in each row of a heater, or set points of a drive
+}
 
 
-@pytest.mark.parametrize("dt, on_change", [(15.0, False), (0.1, True)], ids=["a row each", "many rows"])
-def test_commands_of_a_slow_plant_are_a_stream(dt, on_change):
-    """Every 15 s: a value in each row of a heater, or set points of a drive."""
-    assert sent_on_change(Signal("", 15.0 * np.arange(240.0), np.tile([0.0, 40.0], 120)), dt) == on_change
+@pytest.mark.parametrize("t, y, dt, on_change", CHANGE.values(), ids=CHANGE)
+def test_commands_sent_on_change_are_known_by_their_times_and_values(t, y, dt, on_change):
+    assert sent_on_change(Signal("", t, y), dt) == on_change
 
 
 def test_an_input_that_is_silent_alone_is_seen(tmp_path):
@@ -399,9 +391,8 @@ def test_a_declared_gap_that_would_fill_memory_with_empty_rows_is_refused(tmp_pa
     assert _rows(_import(path, "gap = 100")) == [500, 500]
     with pytest.raises(DataError, match=r"\[import\] gap: 1.01e\+05 rows of 1000 readings would be empty"):
         _import(path, "gap = 1001")
-    assert _rows(_import(_csv(tmp_path / "b.csv", T + 400 * (T >= 5), _columns(T)), "gap = 401\nlongest = 500")) == [
-        41000
-    ]
+    path = _csv(tmp_path / "b.csv", T + 400 * (T >= 5), _columns(T))
+    assert _rows(_import(path, "gap = 401\nlongest = 500")) == [41000]
 
 
 def test_stretches_that_lie_in_several_parts_are_those_of_a_count_at_each_time():

@@ -17,11 +17,10 @@ import subprocess
 
 import h5py
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 import rod
-from helpers import file_rig, nnap
+from helpers import begun, file_rig, nnap
 from shell import ROOT
 
 import nnap_em
@@ -214,12 +213,11 @@ def place(tmp_path_factory):
                 for column in table.dtype.names:
                     file[f"drive/{column}"] = table[column]
         rig = read_rig(root / "bench/rig.toml", specs)
-        fitted = begin(rig, read_logs(root / "bench/train", rig).data, key=jax.random.key(0))
-        information = 1e3 * jnp.eye(fitted.state.hessian.shape[0])
+        fitted = begun(rig, read_logs(root / "bench/train", rig).data)
         for name, logs, more in (("fit", "bench", 0.0), ("other", "february", 1.0), ("january", "february", 0.5)):
             best = dataclasses.replace(fitted.model, log_r=fitted.model.log_r + more)
-            state = fitted.state._replace(best=best, hessian=information, loglik=jnp.zeros(1))
-            save(root / name / "model.npz", fitted._replace(state=state), notes={"logs": [str(root / logs)]})
+            one = fitted._replace(state=fitted.state._replace(best=best))
+            save(root / name / "model.npz", one, notes={"logs": [str(root / logs)]})
         (root / "rod.xml").write_text(rod.FILE)
         (root / "rod.toml").write_text(file_rig("rod.xml", ("hinge", "dhinge"), friction="none", dt=rod.DT))
         machine = begin(read_rig(root / "rod.toml", specs), rod.logs(0), key=jax.random.key(0))
@@ -234,9 +232,13 @@ def beside(place):
 
 
 @pytest.fixture(scope="module")
-def designed(place):
+def fit(place):
+    return load(place / "fit/model.npz")
+
+
+@pytest.fixture(scope="module")
+def designed(place, fit):
     """A small design, tried with few models."""
-    fit = load(place / "fit/model.npz")
     data = read_logs(place / "bench/train", fit.rig).data
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(experiment, "CHECKED", 8)
@@ -252,9 +254,8 @@ def _first(designed: experiment.Design, count: int) -> experiment.Design:
 
 
 @pytest.fixture
-def light(place, beside, designed, monkeypatch):
+def light(place, beside, designed, fit, monkeypatch):
     """The commands without the engines that need minutes: these give what `place` has, and refuse other arguments."""
-    fit = load(place / "fit/model.npz")
 
     def bound(function, result):
         signature = inspect.signature(function)

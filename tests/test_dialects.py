@@ -51,6 +51,14 @@ def _imported(log, path):
     return [np.stack([each[name] for name in (*rig.logged_inputs, *rig.measured)], 1) for each in values]
 
 
+def _close(tables, rows: int, atol: float, parts: int = 1, apart: int | None = None) -> None:
+    """Asserts that so many sequences of so many rows are parts of what was written, each so many rows on."""
+    assert [len(table) for table in tables] == [rows] * parts
+    for k, table in enumerate(tables):
+        part = slice(k * (rows if apart is None else apart), None)
+        np.testing.assert_allclose(table.T, [y[part][:rows] for y in (U, Q, V)], atol=atol)
+
+
 COLUMNS = (T, U, Q, V)
 DEGREES = (T, U, np.degrees(Q), V)
 JOINT = "/joint_states/joint0"
@@ -73,14 +81,9 @@ def _names(separator: str, first: str = "time") -> str:
     return separator.join((first, "u", "theta1", "dtheta1"))
 
 
-UNITS = _table(
-    "Zeit;u;theta1;dtheta1\nms;Nm;°;rad/s",
-    (1e3 * T, *DEGREES[1:]),
-    ";",
-    ",",
-    above=("Prüfstand", "", "2026-01-01;12:00"),
-    encoding="cp1252",
-)
+ABOVE = "Prüfstand", "", "2026-01-01;12:00"
+HEADER = "Zeit;u;theta1;dtheta1\nms;Nm;°;rad/s"
+UNITS = _table(HEADER, (1e3 * T, *DEGREES[1:]), ";", ",", above=ABOVE, encoding="cp1252")
 QUOTED = _table('"time [s]","Motor torque, Nm","theta1 [deg]","dtheta1 [rad/s]"', DEGREES)
 PATHS = _table(f"__time,{JOINT}/effort,{JOINT}/position,{JOINT}/velocity", (1.7e9 + T, *COLUMNS[1:]))
 DATES = functools.partial(dialects.dated, names=_names(";"), columns=COLUMNS)
@@ -124,16 +127,18 @@ def test_what_was_written_is_read(tmp_path, write, name, columns):
     assert len(table) >= len(T) - 2
 
 
-@pytest.mark.parametrize("fixed", [False, True])
-def test_lists_and_episodes_of_lerobot_are_read(tmp_path, fixed):
-    """Each episode is a sequence; the numbers are those of the file, in single precision."""
-    log = dialects.lerobot(tmp_path / "set", fixed=fixed)
-    tables = _imported(log, _rig(tmp_path, LISTS))
-    half = len(T) // 2
-    assert [len(table) for table in tables] == [half, half]
-    for k, table in enumerate(tables):
-        rows = slice(k * half, (k + 1) * half)
-        np.testing.assert_allclose(table.T, [U[rows], Q[rows], V[rows]], atol=1e-6)
+def test_lists_and_episodes_are_sequences(tmp_path):
+    """Of LeRobot, whose numbers are in single precision, and of a table without times."""
+    for fixed in (False, True):
+        log = dialects.lerobot(tmp_path / f"set {fixed}", fixed=fixed)
+        _close(_imported(log, _rig(tmp_path, LISTS)), 100, 1e-6, 2)
+    episode = np.repeat([0, 1], len(T) // 2)
+    for separator, decimal in ((";", ","), (",", ".")):
+        names = separator.join(("episode_index", "u", "theta1", "dtheta1"))
+        log = dialects.table(tmp_path / "train/a.csv", names, (episode, U, Q, V), separator, decimal)
+        _close(_imported(log, _rig(tmp_path)), 100, 2e-8, 2)
+    with pytest.raises(DataError, match=r"line 102, column 'episode_index': another episode begins; `nnap-em im"):
+        read_logs(log.parent, read_rig(tmp_path / "rig.toml", specs))
 
 
 DEG = np.pi / 180
@@ -178,12 +183,8 @@ def test_a_unit_in_a_name_counts_in_every_format(tmp_path, suffix):
     columns = {"time": T, "Torque [Nm]": U, "Angle [deg]": np.degrees(Q), "Speed [rpm]": V * 30 / np.pi}
     log, topic = tmp_path / f"a.{suffix}", "/a:" if suffix in ("h5", "mcap") else ""
     if suffix == "mat":
-        fields = [(f"Signal {k}", name) for k, name in enumerate(columns)][1:]
-        record = np.zeros(3, [("Name", "O"), ("Data", "O")])
-        for k, (_, name) in enumerate(fields):
-            record[k] = (name, columns[name])
-        axis = np.zeros(1, [("Data", "O")])
-        axis[0] = (T,)
+        axis, record = np.zeros(1, [("Data", "O")]), np.zeros(3, [("Name", "O"), ("Data", "O")])
+        axis[0], record[:] = (T,), list(columns.items())[1:]
         scipy.io.savemat(log, {"rec": {"X": axis, "Y": record}})
     elif suffix == "parquet":
         pq.write_table(pa.table(columns), log)
@@ -192,9 +193,9 @@ def test_a_unit_in_a_name_counts_in_every_format(tmp_path, suffix):
     else:
         rows = zip(*(y.tolist() for y in columns.values()), strict=True)
         write_mcap(log, {"/a": (plain_json(), ns(T), [dict(zip(columns, row, strict=True)) for row in rows])})
-    names = {"u": "Torque [Nm]", "theta1": "Angle [deg]", "dtheta1": "Speed [rpm]"}
+    names = dict(zip(("u", "theta1", "dtheta1"), list(columns)[1:], strict=True))
     (table,) = _imported(log, _rig(tmp_path, {name: f'"{topic}{at}"' for name, at in names.items()}))
-    np.testing.assert_allclose(table[:-1].T, [U[: len(table) - 1], Q[: len(table) - 1], V[: len(table) - 1]], atol=1e-5)
+    _close([table[:-1]], len(table) - 1, 1e-5)
 
 
 def test_a_unit_of_the_file_alone_counts(tmp_path):
@@ -207,7 +208,7 @@ def test_a_unit_of_the_file_alone_counts(tmp_path):
     for name, theta1, start in (("a.h5", "/a:q[0]", "/a:"), ("a.csv", "q", "")):
         rig = _rig(tmp_path, {"theta1": f'"{theta1}"', "dtheta1": f'"{start}v"', "u": f'"{start}u"'})
         (table,) = _imported(tmp_path / name, rig)
-        np.testing.assert_allclose(table.T, [U[: len(table)], Q[: len(table)], V[: len(table)]], atol=1e-7)
+        _close([table], len(table), 1e-7)
 
 
 def test_a_unit_that_is_not_known_is_named(tmp_path):
@@ -254,23 +255,7 @@ def test_runs_of_one_file_with_times_of_day_are_sequences(tmp_path, header, text
         fields = stamp.split(",") if ":" in stamp else [stamp.replace(".", decimal)]
         rows.append(separator.join([*fields, *numbers]))
     (tmp_path / "a.csv").write_text("\n".join(rows) + "\n")
-    tables = _imported(tmp_path / "a.csv", _rig(tmp_path))
-    assert [len(table) for table in tables] == [100, 100, 100]
-    for table in tables:
-        np.testing.assert_allclose(table.T, [U[:100], Q[:100], V[:100]], atol=1e-6)
-
-
-@pytest.mark.parametrize("separator, decimal", [(",", "."), (";", ",")])
-def test_episodes_without_times_are_sequences(tmp_path, separator, decimal):
-    episode = np.repeat([0, 1], len(T) // 2)
-    names = separator.join(("episode_index", "u", "theta1", "dtheta1"))
-    log = dialects.table(tmp_path / "train/a.csv", names, (episode, U, Q, V), separator, decimal)
-    tables = _imported(log, _rig(tmp_path))
-    assert [len(table) for table in tables] == [100, 100]
-    np.testing.assert_allclose(tables[1].T, [U[100:], Q[100:], V[100:]], atol=2e-8)
-    if separator == ",":
-        with pytest.raises(DataError, match=r"line 102, column 'episode_index': another episode begins; `nnap-em im"):
-            read_logs(log.parent, read_rig(tmp_path / "rig.toml", specs))
+    _close(_imported(tmp_path / "a.csv", _rig(tmp_path)), 100, 1e-6, 3, apart=0)
 
 
 DATASET = functools.partial(dialects.matlab_object, name="logsout", kind="Simulink.SimulationData.Dataset")
@@ -321,23 +306,17 @@ def test_a_draft_of_another_dialect_is_imported(tmp_path):
     assert (read_rig(drafted, specs).dt, read_rig(drafted, specs).input_columns) == (DT, ("fTorque",))
     assert '"theta1" = { from = "theta1_deg", scale = 0.0174532925 }' in drafted.read_text()
     (table,) = _imported(log, drafted)
-    np.testing.assert_allclose(table.T, [U[: len(table)], Q[: len(table)], V[: len(table)]], atol=2e-8)
+    _close([table], len(table), 2e-8)
 
 
-@pytest.mark.parametrize(
-    "names", [f"{JOINT}/position,{JOINT}/velocity", "MAIN.joint0.ActPos [deg],MAIN.joint0.ActVelo [rad/s]"]
-)
-def test_joints_of_a_machine_are_found_in_paths(tmp_path, names):
-    model = tmp_path / "arm.xml"
-    model.write_text(ARM)
-    angle = np.degrees(Q) if "deg" in names else Q
-    log = dialects.table(tmp_path / "a.csv", f"__time,{names}", (T, angle, V))
-    text = draft_machine(log, model, tmp_path).text
-    assert f"dt = {DT}" in text and 'columns = ["joint0", "djoint0"]' in text
-    at = f'"{names.split(",")[0]}"'
-    assert (
-        f'"joint0" = {{ from = {at}, scale = 0.0174532925 }}' in text if "deg" in names else f'"joint0" = {at}' in text
-    )
+def test_joints_of_a_machine_are_found_in_paths(tmp_path):
+    (model := tmp_path / "arm.xml").write_text(ARM)
+    paths = f"{JOINT}/position,{JOINT}/velocity", "MAIN.joint0.ActPos [deg],MAIN.joint0.ActVelo [rad/s]"
+    for names, angle, of in ((paths[0], Q, "{}"), (paths[1], np.degrees(Q), "{{ from = {}, scale = 0.0174532925 }}")):
+        log = dialects.table(tmp_path / "a.csv", f"__time,{names}", (T, angle, V))
+        text = draft_machine(log, model, tmp_path).text
+        assert f"dt = {DT}" in text and 'columns = ["joint0", "djoint0"]' in text
+        assert '"joint0" = ' + of.format(f'"{names.split(",")[0]}"') in text
 
 
 WORDS = {  # a path, and its last word
@@ -348,10 +327,10 @@ WORDS = {  # a path, and its last word
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("path, word", WORDS.items())
-def test_the_last_word_of_a_path(path, word):
-    assert last_word(path) == word
-    assert word_of(f"{path} [deg]" if "[" not in path else path)[1] == (np.pi / 180 if "[" not in path else 1.0)
+def test_the_last_word_of_a_path():
+    for path, word in WORDS.items():
+        assert last_word(path) == word
+        assert word_of(f"{path} [deg]" if "[" not in path else path)[1] == (DEG if "[" not in path else 1.0)
 
 
 def test_a_name_with_a_colon_is_no_topic(tmp_path):
@@ -364,43 +343,37 @@ def test_a_name_with_a_colon_is_no_topic(tmp_path):
 
 @pytest.mark.parametrize("suffix", ["csv", "parquet"])
 def test_a_log_without_times_is_read_where_dt_is_declared(tmp_path, suffix):
+    """One whose times have another name is refused."""
     path = tmp_path / f"train/01.{suffix}"
     path.parent.mkdir()
-    if suffix == "csv":
-        dialects.table(path, "u,theta1,dtheta1", COLUMNS[1:])
-    else:
-        pq.write_table(pa.table({"u": U, "theta1": Q, "dtheta1": V}), path)
-    rig = read_rig(_rig(tmp_path), specs)
+    rig, columns = read_rig(_rig(tmp_path), specs), dict(zip(("u", "theta1", "dtheta1"), COLUMNS[1:], strict=True))
+    write = formats.write_csv if suffix == "csv" else lambda path, columns: pq.write_table(pa.table(columns), path)
+    write(path, columns)
     with pytest.warns(DataWarning, match=r"no column of times: rows are taken as dt = 0.004 s apart; log the time"):
         data = read_logs(path.parent, rig).data
     np.testing.assert_allclose(data.t[0], T, atol=1e-12)
     np.testing.assert_allclose(data.y[0].T, [Q, V], atol=2e-8)
-
-
-def test_a_log_whose_times_have_another_name_is_refused(tmp_path):
-    (tmp_path / "train").mkdir()
-    dialects.table(tmp_path / "train/01.csv", "t_ms,u,theta1,dtheta1", (1e3 * T, *COLUMNS[1:]))
+    write(path, {"t_ms": 1e3 * T} | columns)
     with pytest.raises(DataError, match="column 'time': missing"):
-        read_logs(tmp_path / "train", read_rig(_rig(tmp_path), specs))
+        read_logs(path.parent, rig)
 
 
 def test_structs_with_different_clocks_are_refused(tmp_path):
     def struct(t, y):
         return {"time": t, "signals": {"values": y, "label": "", "dimensions": 1}}
 
-    scipy.io.savemat(tmp_path / "a.mat", {"u": struct(T, U), "theta1": struct(T[::2], Q[::2]), "dtheta1": struct(T, V)})
-    with pytest.raises(
-        DataError, match="column 'time': stands there twice with different numbers; save signals of one"
-    ):
-        reader(tmp_path / "a.mat").topics(tmp_path / "a.mat")
+    path, said = tmp_path / "a.mat", "column 'time': stands there twice with different numbers; save signals of one"
+    scipy.io.savemat(path, {"u": struct(T, U), "theta1": struct(T[::2], Q[::2]), "dtheta1": struct(T, V)})
+    with pytest.raises(DataError, match=said):
+        reader(path).topics(path)
 
 
-@pytest.mark.parametrize("name", ["out", "yout"])
-def test_columns_of_a_matrix_have_numbers(tmp_path, name):
+def test_columns_of_a_matrix_have_numbers(tmp_path):
     """Simulink's format Array."""
-    scipy.io.savemat(tmp_path / "a.mat", {"tout": T[:, None], name: np.stack([Q, V], 1)})
-    (topic,) = reader(tmp_path / "a.mat").topics(tmp_path / "a.mat")
-    assert topic.fields == (f"{name}[0]", f"{name}[1]") and "'tout'" in topic.kind
+    for name in ("out", "yout"):
+        scipy.io.savemat(tmp_path / "a.mat", {"tout": T[:, None], name: np.stack([Q, V], 1)})
+        (topic,) = reader(tmp_path / "a.mat").topics(tmp_path / "a.mat")
+        assert topic.fields == (f"{name}[0]", f"{name}[1]") and "'tout'" in topic.kind
 
 
 def test_a_plain_csv_file_is_none_of_another_dialect(tmp_path):
@@ -414,7 +387,7 @@ def test_a_codesys_trace_with_a_line_of_its_own_is_read(tmp_path):
     log = dialects.codesys(tmp_path / "a.trace.csv")
     log.write_text(log.read_text().replace("Flags; 16", "Flags\nComment\n;\n\nFlags;"))
     (table,) = _imported(log, _rig(tmp_path))
-    np.testing.assert_allclose(table.T, [U[: len(table)], Q[: len(table)], V[: len(table)]], atol=2e-8)
+    _close([table], len(table), 2e-8)
 
 
 @pytest.mark.parametrize("rows", [0, 1])

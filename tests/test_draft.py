@@ -63,13 +63,12 @@ def test_what_a_log_tells_is_right(tmp_path, names, given, system, inputs):
     assert set(rig.noise_std) == set(rig.measured)
 
 
-@pytest.mark.parametrize("key", [name for name in specs["acrobot"].parameters if name != "g"])
-def test_a_line_that_is_not_filled_in_is_refused_by_name(tmp_path, key):
+def test_lines_that_are_not_filled_in_are_refused_by_name(tmp_path):
     text = _draft(tmp_path, "tau2", "theta1", "theta2").text
-    incomplete = re.sub(rf"(?m)^# (?!{key} )(\w+) = \.\.\.", r"\1 = 0.2", text)
-    (tmp_path / "rig.toml").write_text(incomplete)
-    with pytest.raises(RigError, match=rf"rig.toml: \[model\] {key}: missing .*write {key} = 0.2"):
-        read_rig(tmp_path / "rig.toml", specs)
+    for key in (name for name in specs["acrobot"].parameters if name != "g"):
+        (tmp_path / "rig.toml").write_text(re.sub(rf"(?m)^# (?!{key} )(\w+) = \.\.\.", r"\1 = 0.2", text))
+        with pytest.raises(RigError, match=rf"rig.toml: \[model\] {key}: missing .*write {key} = 0.2"):
+            read_rig(tmp_path / "rig.toml", specs)
 
 
 FROM_ZERO = {  # columns, then inputs and joints, and the names that the notes ask for
@@ -123,44 +122,37 @@ def test_columns_to_rename_or_convert_are_named(tmp_path, names, notes):
     assert "; ".join(_draft(tmp_path, *names, system="pendulum").notes) == notes
 
 
-def test_a_clock_in_ms_and_no_clock_are_noticed(tmp_path):
-    path = tmp_path / "01.csv"
+MS = "column 't_ms': name it 'time' and convert it from ms to s"
+CLOCKS = {  # the clock of a log as it would be right, and what is noted
+    "in ms by its name": (lambda t: {"t_ms": 1000 * t}, MS),
+    "in ms": (lambda t: {"time": 1000 * t}, "column 'time': rows are 20 s apart: is the clock in ms? write s"),
+    "none": (lambda t: {}, "no column 'time': add one [s], or write [sampling] dt"),
+    "set back": (lambda t: {"time": t - DT * (np.arange(ROWS) > 7)},
+        "line 10, column 'time': time does not run on: remove or correct the row"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("clock, note", CLOCKS.values(), ids=CLOCKS)
+def test_a_clock_that_is_none_is_noticed(tmp_path, clock, note):
     columns = _log("u", "x")
-    write_csv(path, {"t_ms" if n == "time" else n: v * (1000 if n == "time" else 1) for n, v in columns.items()})
-    drafted = draft(path, None, specs)
-    assert drafted.notes == ("column 't_ms': name it 'time' and convert it from ms to s",)
-    assert f"dt = {DT}" in drafted.text
-    write_csv(path, {name: columns[name] for name in ("u", "x")})
-    drafted = draft(path, None, specs)
-    assert drafted.notes == ("no column 'time': add one [s], or write [sampling] dt",)
-    assert drafted.missing == {"model": ["m"], "sampling": ["dt"]}
-    write_csv(path, columns | {"time": 1000 * columns["time"]})
-    assert draft(path, None, specs).notes == ("column 'time': rows are 20 s apart: is the clock in ms? write s",)
-    write_csv(path, columns | {"time": columns["time"] - DT * (np.arange(ROWS) > 7)})
-    assert draft(path, None, specs).notes == (
-        "line 10, column 'time': time does not run on: remove or correct the row",
-    )
+    write_csv(tmp_path / "01.csv", clock(columns.pop("time")) | columns)
+    drafted = draft(tmp_path / "01.csv", None, specs)
+    assert drafted.notes == (note,) and (note != MS or f"dt = {DT}" in drafted.text)
+    assert note[:2] != "no" or drafted.missing == {"model": ["m"], "sampling": ["dt"]}
 
 
-def test_jitter_session_and_lost_columns_are_left_to_the_owner(tmp_path):
-    path = tmp_path / "01.csv"
-    columns = _log("note", t0=5.0)
+def test_jitter_session_lost_columns_and_noise_without_a_signal_are_left_to_the_owner(tmp_path):
+    path, columns = tmp_path / "01.csv", _log("note", t0=5.0)
     columns["time"][7] += 0.1 * DT
     write_csv(path, columns)
     drafted = draft(path, "slide", specs)
     lists = {"input": ["columns", "joints"], "sampling": ["dt"], "measurement": ["columns"]}
     assert drafted.missing == {"model": ["m"]} | lists
-    assert "0.018 to 0.022 s apart: resample" in drafted.text
-    assert 'clock = "session"' in drafted.text
-
-
-def test_noise_without_a_signal_is_not_declared(tmp_path):
-    path = tmp_path / "01.csv"
+    assert "0.018 to 0.022 s apart: resample" in drafted.text and 'clock = "session"' in drafted.text
     noise = np.random.default_rng(0).normal(size=ROWS)
     write_csv(path, _log("u") | {"x": noise, "dx": 0 * noise})
     text = draft(path, None, specs).text
-    assert re.search(r"(?m)^# x = ", text)
-    assert re.search(r"(?m)^# dx = 0 ", text)
+    assert re.search(r"(?m)^# x = ", text) and re.search(r"(?m)^# dx = 0 ", text)
 
 
 @pytest.mark.parametrize(

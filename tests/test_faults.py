@@ -1,8 +1,7 @@
 """kill -9, Ctrl-C and disks that are full: the last good state is kept and told, and the numbers are those of no fault.
 
-Every kind of fault hits a command whose steps cost nothing, in this process.  One run of each real command is killed in
-a process of its own and goes on to its end in this one, which has made the unbroken runs: a command is traced once.
-`benchmarks/faults.py` kills many, at moments drawn from a seed.
+Every kind of fault hits a command whose steps cost nothing, in this process.  One run of `diagnose` is killed in a
+process of its own and goes on to its end.  `benchmarks/faults.py` kills many, at moments drawn from a seed.
 """
 
 import errno
@@ -25,24 +24,25 @@ import numpy as np
 import plant
 import pytest
 from faults import numbers
+from helpers import begun
 from shell import ENVIRONMENT
 
 from nnap_em.commands import check as check_command
 from nnap_em.commands import cli
+from nnap_em.commands import diagnose as diagnose_command
 from nnap_em.commands import identify as identify_command
+from nnap_em.commands.identify import MISFIT_STATUS
+from nnap_em.data.logs import read_logs
+from nnap_em.data.rig import read_rig
 from nnap_em.effects import catalogue
-from nnap_em.fit.identify import Identified
-from nnap_em.fit.store import load
 from nnap_em.numerics.digest import digest
 from nnap_em.storage import files, journal
 from nnap_em.storage.files import StoreError, sweep
 from nnap_em.storage.journal import HERE, Journal, keeping, step
+from nnap_em.systems import specs
 
 SPRING = {"name": "torsional_spring", "joint": 1, "k": 20.0, "theta0": 0.05}
 SLIDE = plant.Case(system="slide", sequences=8, tests=1, steps=95, seed=2, noise=(5e-4, 5e-3), effects=(SPRING,))
-FOUND = {"identify": [], "diagnose": ["torsional_spring"]}
-DONE = (0, identify_command.MISFIT_STATUS)
-"""A spring is missing: friction alone may not describe the motion."""
 IDENTIFY, DIAGNOSE = ("identify", "--epochs", "14"), ("diagnose",)
 
 
@@ -117,18 +117,25 @@ def _toy(x, i):
     return np.cos(x + i)
 
 
-def _toy_identify(fitted: Identified):
-    """`identify` of twelve steps of NumPy, whose numbers stand for the log-likelihoods of `fitted`."""
+def _steps_of_a_toy() -> np.ndarray:
+    x = np.arange(3.0)
+    for i in range(12):
+        x = _toy(x, i)
+    return x
+
+
+def _toys(patch, rig: Path) -> None:
+    """`identify` and `diagnose` of twelve steps of NumPy, whose numbers stand for log-likelihoods."""
+    declared = read_rig(rig / "rig.toml", specs)
+    fitted = begun(declared, read_logs(rig / "train", declared).data)
 
     def identify(rig, data, *, watch, **_):
-        x = np.arange(3.0)
-        for i in range(12):
-            x = _toy(x, i)
-        state = fitted.state._replace(loglik=x)
+        state = fitted.state._replace(loglik=_steps_of_a_toy())
         watch(state, data.t.shape[1], np.ones(len(data.t), bool))
         return fitted._replace(state=state)
 
-    return identify
+    patch.setattr(identify_command, "identify", identify)
+    patch.setattr(diagnose_command, "diagnose", lambda *_, **__: _steps_of_a_toy())
 
 
 ERRORS = {"full disk": "File too large", "unwritable": "Permission denied"}
@@ -149,11 +156,10 @@ FAULTS: list[tuple[str, int | str]] = [
 ]
 
 
-@pytest.mark.slow  # fast: test_a_step_is_done_once_for_the_same_arguments
-def test_a_chain_of_all_faults_is_survived(rig, whole, tmp_path, monkeypatch, capsys):
+def test_a_chain_of_all_faults_is_survived(rig, tmp_path, monkeypatch, capsys):
     """One run that meets all the faults, one after the other, and then goes on to its end; numbers as of no fault."""
-    monkeypatch.setattr(identify_command, "identify", _toy_identify(load(whole["identify"] / "model.npz")))
-    assert cli.main(_order(IDENTIFY, rig, tmp_path / "whole")) in DONE
+    _toys(monkeypatch, rig)
+    assert cli.main(_order(IDENTIFY, rig, tmp_path / "whole")) == 0
     capsys.readouterr()
     out, more, kept = tmp_path / "broken", (), 0
     for kind, when in FAULTS:
@@ -178,7 +184,7 @@ def test_a_chain_of_all_faults_is_survived(rig, whole, tmp_path, monkeypatch, ca
         assert steps >= kept  # nothing is lost
         more, kept = ("--resume",), steps
     assert kept == 12
-    assert cli.main(_order(IDENTIFY, rig, out, "--resume")) in DONE
+    assert cli.main(_order(IDENTIFY, rig, out, "--resume")) == 0
     assert "resumed with 12 finished steps" in capsys.readouterr().err
     assert not list(out.rglob(".*.part")) and not (out / "unfinished").exists()
     left = numbers(out)
@@ -199,16 +205,6 @@ def _start(order: list[str]) -> subprocess.Popen:
     return subprocess.Popen([*program, *order], env=ENVIRONMENT, stderr=subprocess.PIPE, text=True)
 
 
-@pytest.fixture(scope="module")
-def whole(rig) -> dict[str, Path]:
-    """Unbroken runs by the name of the command."""
-    outs = {command[0]: rig.parent / f"whole {command[0]}" for command in (IDENTIFY, DIAGNOSE)}
-    for command in (IDENTIFY, DIAGNOSE):
-        code, said = _called(_order(command, rig, outs[command[0]], "--quiet"))
-        assert code in DONE, said
-    return outs
-
-
 def _steps(out: Path) -> list[int]:
     """Tells one state of the finished steps from the next."""
     return sorted(path.stat().st_mtime_ns for path in out.glob("unfinished/*.npz"))
@@ -227,25 +223,25 @@ def _struck(order: list[str], out: Path, kind: signal.Signals, count: int):
     return run.returncode, said
 
 
-@pytest.mark.slow  # fast: test_a_step_is_done_once_for_the_same_arguments
-@pytest.mark.parametrize("command", [IDENTIFY, DIAGNOSE], ids=lambda command: command[0])
-def test_a_command_that_is_killed_and_stopped_goes_on_to_the_same_numbers(rig, whole, tmp_path, command):
+@pytest.mark.slow  # fast: test_a_chain_of_all_faults_is_survived
+def test_a_search_that_is_killed_and_stopped_goes_on_to_the_same_numbers(rig, tmp_path):
     """By SIGKILL, and then by Ctrl-C."""
-    out = tmp_path / "broken"
-    code, said = _struck(_order(command, rig, out), out, signal.SIGKILL, 4)
+    whole, out = tmp_path / "whole", tmp_path / "broken"
+    code, said = _called(_order(DIAGNOSE, rig, whole, "--quiet"))
+    assert code == 0, said
+    code, said = _struck(_order(DIAGNOSE, rig, out), out, signal.SIGKILL, 4)
     assert code == -signal.SIGKILL, said
-    code, said = _struck(_order(command, rig, out, "--resume"), out, signal.SIGINT, 2)
+    code, said = _struck(_order(DIAGNOSE, rig, out, "--resume"), out, signal.SIGINT, 2)
     assert code == 130, said
-    assert re.search(rf"stopped .*; to go on: nnap-em {command[0]} .*--resume", _last_line(said))
-    if command is DIAGNOSE:
-        _answered_in_time(rig, out)
-    code, said = _called(_order(command, rig, out, "--resume"))
-    assert code in DONE and "resumed" in said, said
+    assert re.search(r"stopped .*; to go on: nnap-em diagnose .*--resume", _last_line(said))
+    _answered_in_time(rig, out)
+    code, said = _called(_order(DIAGNOSE, rig, out, "--resume"))
+    assert code == 0 and "resumed" in said, said
     assert not list(out.rglob(".*.part")) and not (out / "unfinished").exists()
     left = numbers(out)
-    assert left == numbers(whole[command[0]])
+    assert left == numbers(whole)
     assert all(len(left[name][0]) > 20 for name in left if name.endswith(".npz"))
-    assert [effect["name"] for effect in left["report"].get("effects", [])] == FOUND[command[0]]
+    assert [effect["name"] for effect in left["report"]["effects"]] == ["torsional_spring"]
 
 
 def _called(order: list[str]) -> tuple[int, str]:
@@ -259,7 +255,7 @@ def _answered_in_time(rig: Path, out: Path) -> None:
     """An answer after the first fit, since no more time is left, and what goes on from there."""
     steps = len(_steps(out))
     code, said = _called(_order(DIAGNOSE, rig, out, "--resume", "--minutes", "0.001"))
-    assert code in DONE and re.search(r"\[\d+:\d\d over\] ", said), said
+    assert code == MISFIT_STATUS and re.search(r"\[\d+:\d\d over\] ", said), said
     assert re.search(r"finished steps? kept; to go on: nnap-em diagnose .*--resume", _last_line(said))
     report = json.loads((out / "report.json").read_text())
     assert not report["complete"] and not report["effects"]
@@ -278,6 +274,7 @@ def stopped(rig) -> dict[str, Path]:
     for command, count in ((IDENTIFY, 1), (DIAGNOSE, 2)):
         out = outs[command[0]] = rig.parent / f"stopped {command[0]}"
         with pytest.MonkeyPatch.context() as patch, pytest.raises(Killed):
+            _toys(patch, rig)
             patch.setattr(files, "replace_bytes", _faulty("after a write", count))
             cli.main(_order(command, rig, out, "--quiet"))
     return outs
@@ -330,8 +327,8 @@ REFUSED = {
     "smoother": (lambda out, rig: None, ("--smoother", "ekf"), SMOOTHER),
     "particles": (lambda out, rig: None, ("--smoother", "particle", "--particles", "9"), SMOOTHER),
 }
-OF_ALL = [name for name in REFUSED if REFUSED[name][2] != SMOOTHER]  # identify alone has a choice of smoothers
-RUNS = [*((IDENTIFY, name) for name in REFUSED), *((DIAGNOSE, name) for name in OF_ALL)]
+# identify alone has a choice of smoothers; what they have in common is shown by it
+RUNS = [*((IDENTIFY, name) for name in REFUSED), *((DIAGNOSE, name) for name in ("truncated", "data", "seed"))]
 
 
 @pytest.mark.parametrize("command, case", RUNS, ids=[f"{name}-{command[0]}" for command, name in RUNS])
@@ -360,7 +357,7 @@ def test_steps_of_another_version_are_refused(rig, stopped, tmp_path, capsys, mo
     assert re.search(rf"{_first(out)}: format 1 .*, this version reads format 2", _last_line(capsys.readouterr().err))
 
 
-@pytest.mark.parametrize("command", [IDENTIFY, DIAGNOSE], ids=["identify", "diagnose"])
+@pytest.mark.parametrize("command", [IDENTIFY, DIAGNOSE], ids=lambda command: command[0])
 def test_a_folder_that_cannot_be_is_refused_before_the_work(rig, tmp_path, capsys, command):
     (tmp_path / "file").write_text("")
     assert cli.main(_order(command, rig, tmp_path / "file" / "out")) == 2

@@ -1,6 +1,7 @@
 """What was found, as it is told: each effect with its own curve, joint and units, whatever stands beside it."""
 
 import dataclasses
+import functools
 import json
 
 import jax
@@ -18,7 +19,7 @@ from nnap_em.diagnosis.keys import key_of
 from nnap_em.diagnosis.outcome import Diagnosis, Step, Suspect
 from nnap_em.effects import AbstractEffect, Candidate, catalogue
 from nnap_em.effects.function import Axis
-from nnap_em.fit.identify import begin
+from nnap_em.fit.identify import Identified, begin
 from nnap_em.report import identification
 from nnap_em.report.diagnosis import write_diagnosis
 
@@ -46,9 +47,15 @@ def _function(signal: str, joint: int, slope: float) -> AbstractEffect:
     return catalogue["unknown_function"](slope * axis.centres(), (axis,), joint=joint)
 
 
+@functools.cache
+def _begun(name: str) -> Identified:
+    rig = {"arm": ARM, "slide": SLIDE}[name]
+    return begin(rig, _data(rig), key=jax.random.key(0))
+
+
 def _closed(rig: Rig, *effects: AbstractEffect) -> Diagnosis:
     """A search that found these, in this order."""
-    before = begin(rig, _data(rig), key=jax.random.key(0))
+    before = _begun(rig.name)
     hypothesis = Hypothesis(before.model, before.m_step)
     for effect in effects:
         candidate = Candidate(effect, (effect,), effect)
@@ -84,40 +91,32 @@ def test_a_curve_has_the_units_of_its_machine():
     assert "N/m" in finding.sentence and "N m" not in finding.sentence
 
 
-@pytest.mark.parametrize(
-    ("law", "same"),
-    [
+def test_a_tilted_base_and_a_biased_first_angle_are_listed_with_each_other():
+    bias = catalogue["sensor_bias"].of
+    for law, same in (
         (catalogue["base_tilt"].of(0.1), {("sensor_bias", None, "theta1", ())}),
-        (catalogue["sensor_bias"].of(0.1, channel="theta1"), {("base_tilt", None, None, ())}),
-        (catalogue["sensor_bias"].of(0.1, channel="theta2"), set()),
-    ],
-)
-def test_a_tilted_base_and_a_biased_first_angle_are_listed_with_each_other(law, same):
-    (finding,) = findings(_closed(ARM, law))
-    assert set(finding.equivalent) == same
+        (bias(0.1, channel="theta1"), {("base_tilt", None, None, ())}),
+        (bias(0.1, channel="theta2"), set()),
+    ):
+        (finding,) = findings(_closed(ARM, law))
+        assert set(finding.equivalent) == same
 
 
 def test_a_law_names_its_headline_number_first():
     """The mass of a payload, before its centre, which may be surer."""
     load = catalogue["payload"](jnp.asarray(0.4), jnp.zeros(3), (0.1, 0.0, 0.0), joint=2)
-    system = begin(ARM, _data(ARM), key=jax.random.key(0)).model.system
+    system = _begun("arm").model.system
     assert list(estimates(load, np.eye(4), system)) == ["mass", "centre_x", "centre_y", "centre_z"]
 
 
 def test_a_law_by_many_steps_has_shares_and_one_that_was_read_off_has_nats():
+    """And a law of known form no shape."""
     nats, shares = Evidence(100.0), Evidence(share=0.4, chance=0.02, parts=(4, 5), removed=0.5)
-    for found, known in (
-        (nats, {"log_likelihood_gain"}),
-        (shares, {"share_of_error", "chance"}),
-    ):
-        diagnosis = _closed(ARM, _spring(2))
+    diagnosis = _closed(ARM, _spring(2))
+    for found, known in ((nats, {"log_likelihood_gain"}), (shares, {"share_of_error", "chance"})):
         (finding,) = findings(diagnosis._replace(evidence=(found,)))
         numbers = {name for name, value in finding.evidence.items() if name != "parts" and np.isfinite(value)}
         assert numbers == known and finding.evidence["parts"] == list(found.parts)
-
-
-def test_a_law_of_known_form_has_no_shape():
-    (finding,) = findings(_closed(ARM, _spring(2)))
     assert finding.curve is None and finding.shape is None and "shape" not in entry(finding)
 
 
@@ -162,10 +161,7 @@ def test_a_suspect_is_named_with_its_share_and_the_chance_level():
     first, second, *_ = advice([], (), [suspect])
     assert "record as many different motions" in first
     assert second == f"To see a motor gain at joint 2 by itself: {catalogue['motor_gain'].confirm}"
-    for law, named in (
-        ("unknown function of u", "an unknown function of u"),
-        ("cogging at joint 1", "cogging at joint 1"),
-    ):
+    for law, named in (("unknown function of u", "an unknown function of u"), 2 * ("cogging at joint 1",)):
         assert advice([], (), [suspect._replace(law=law)])[1].startswith(f"To see {named} by itself")
 
 

@@ -49,22 +49,24 @@ def _state(top, stride: float = 0.6, **changes) -> EMState:
     return state._replace(**changes)
 
 
-def test_a_likelier_model_is_taken_and_the_next_stride_is_longer():
-    for loglik in ([1.0, 3.0], [0.0, 1.1]):  # half a nat is noise
-        after = loop._judge(_state([0.0, 2.0]), _heavy(2.5), jnp.ones((1, 1)), np.array(loglik), np.ones(2, bool))
-        assert (_mass(after.best), _mass(after.proposal), after.stride) == (1.5, 2.5, 1.0)
-        assert _mass(after.model) == 2.5
-        np.testing.assert_array_equal(after.top, loglik)
-        np.testing.assert_array_equal(after.loglik, [0, 0, 0, np.mean(loglik)])
+JUDGED = {  # likelihood of 1.5, use of the sequences, what is best then, the next stride, what is tried next
+    "likelier": ([1.0, 3.0], [1, 1], 1.5, 1.0, 2.5),
+    "half a nat is noise": ([0.0, 1.1], [1, 1], 1.5, 1.0, 2.5),
+    "worse: back, and a third of the way from the best": ([0.0, 0.9], [1, 1], 1.0, 0.2, 1.0 + 0.2 * 3.0),
+    "worse where it was left out": ([1.0, -1e9], [1, 0], 1.5, 1.0, 2.5),
+}
 
 
-def test_a_worse_model_is_refused_and_the_way_from_the_best_is_shorter():
-    after = loop._judge(_state([0.0, 2.0]), _heavy(2.5), jnp.ones((1, 1)), np.array([0.0, 0.9]), np.ones(2, bool))
-    assert (_mass(after.best), _mass(after.proposal)) == (1.0, 4.0)
-    assert after.stride == pytest.approx(0.2)
-    assert _mass(after.model) == pytest.approx(1.0 + 0.2 * 3.0)
-    np.testing.assert_array_equal(after.top, [0.0, 2.0])
-    assert after.epoch == 4
+@pytest.mark.parametrize(("loglik", "used", "best", "stride", "tried"), JUDGED.values(), ids=JUDGED)
+def test_a_model_is_judged_by_its_likelihood(loglik, used, best, stride, tried):
+    used = np.array(used) > 0
+    begun = _state(np.where(used, [0.0, 2.0], np.nan))
+    after = loop._judge(begun, _heavy(2.5), jnp.ones((1, 1)), np.array(loglik), used)
+    assert (_mass(after.best), after.epoch) == (best, 4)
+    assert (after.stride, _mass(after.model)) == (pytest.approx(stride), pytest.approx(tried))
+    assert _mass(after.proposal) == (2.5 if best == 1.5 else 4.0)
+    np.testing.assert_array_equal(after.top, np.where(used, loglik, np.nan) if best == 1.5 else begun.top)
+    np.testing.assert_array_equal(after.loglik, [0, 0, 0, np.mean(np.array(loglik)[used])])
 
 
 class _Along(NamedTuple):
@@ -105,13 +107,8 @@ def test_a_fall_is_judged_once_more_with_all_rows_in_sight_only(monkeypatch):
     def em_step(model, data, *_, kept, **__):
         horizons.append(int(data.valid[0].sum()))
         kept_paths.append(kept is PATH)
-        return (
-            model,
-            MStepInfo(jnp.ones((1, 1)), np.ones(4, bool)),
-            -10.0 * len(horizons) * np.ones(4),
-            np.full(4, np.inf),
-            PATH,
-        )
+        info, fall = MStepInfo(jnp.ones((1, 1)), np.ones(4, bool)), -10.0 * len(horizons) * np.ones(4)
+        return model, info, fall, np.full(4, np.inf), PATH
 
     monkeypatch.setattr(loop, "em_step", em_step)
     monkeypatch.setattr(loop, "_rise", lambda *_: judged.append(horizons[-1]) or 1.0)
@@ -119,15 +116,6 @@ def test_a_fall_is_judged_once_more_with_all_rows_in_sight_only(monkeypatch):
     loop.fit(state, DATA, CubatureSmoother(StartBank((1, 1))), RULE, epochs=6, schedule=Schedule(first=4, growth=3.0))
     assert horizons == [4, 4, 9, 9, 9] and judged == [9, 9]
     assert kept_paths == [False, False, False, True, True]
-
-
-def test_a_sequence_that_was_left_out_refuses_nothing():
-    after = loop._judge(
-        _state([0.0, np.nan]), _heavy(2.5), jnp.ones((1, 1)), np.array([1.0, -1e9]), np.array([1, 0]) > 0
-    )
-    assert _mass(after.best) == 1.5
-    assert after.top[0] == 1.0 and np.isnan(after.top[1])
-    assert after.loglik[-1] == 1.0
 
 
 def test_a_horizon_is_held_and_grows():
@@ -190,7 +178,7 @@ def test_the_likeliest_process_noise_is_where_it_begins(monkeypatch):
 # --- a refit: the same decisions along one path
 
 
-def _refit(monkeypatch, **options):
+def test_a_refit_goes_back_a_third_of_the_way_and_keeps_the_best(monkeypatch):
     """Steps of 3 in a log variance whose likelihood is best at 1; a sequence without use wants the contrary."""
     tried, strides = [], []
 
@@ -206,72 +194,51 @@ def _refit(monkeypatch, **options):
     monkeypatch.setattr(refits, "locals_along", lambda *_: None)
     monkeypatch.setattr(refits, "each", smoothed)
     monkeypatch.setattr(ScoringMStep, "advance", advance)
-    return refits.refit(MODEL, RULE, PATH, DATA, np.array([True, True, False]), **options), tried, strides
-
-
-def test_a_refit_goes_back_a_third_of_the_way_and_keeps_the_best(monkeypatch):
-    trial, tried, _ = _refit(monkeypatch, passes=5)
+    trial = refits.refit(MODEL, RULE, PATH, DATA, np.array([True, True, False]), passes=5)
     # 3 is worse than 0: a third of it; from 1 on with twice the share, and a third of that
     np.testing.assert_allclose(tried, [0.0, 3.0, 1.0, 3.0, 1.0 + 2 / 3], atol=1e-12)
     np.testing.assert_allclose(trial.model.log_q, 1.0)
     np.testing.assert_allclose(trial.loglik, 0.0, atol=1e-9)
     brief, late = (rule.weights(MODEL).prior_precision(MODEL.unknown) for rule in (RULE.while_growing(), RULE))
     np.testing.assert_allclose(trial.hessian - late + brief, 1.0, rtol=1e-6)  # stated under the rule that was given
-
-
-def test_a_refit_holds_the_noise_in_its_first_passes(monkeypatch):
-    assert _refit(monkeypatch, passes=5)[2] == [0.0, 0.0, 0.0, 1.5, 1.5]  # the path finds its place first
+    assert strides == [0.0, 0.0, 0.0, 1.5, 1.5]  # the noise is held until the path has found its place
 
 
 # --- the finish on multi-step errors
 
 
-def test_a_gauss_newton_step_is_halved_until_the_errors_fall(monkeypatch):
-    """Errors |z - 1/2| of a parameter whose step is always 1: half of it is taken, and then nothing more."""
-    size = lambda model: 0.01 + abs(float(RULE.prior.read(model)[0]) - 0.5)  # noqa: E731
-    many = lambda model: np.full((4, 3, 2, 1), size(model))  # noqa: E731
-    one = lambda model: np.ones((4, 3, 2, 1, RULE.weights(model).nodes.size + 1))  # noqa: E731
-    monkeypatch.setattr(multistep, "followed", _followed)
-    monkeypatch.setattr(
-        multistep, "open_loop", lambda along, *_: OpenLoop(many(along.model), one(along.model), np.ones(2))
-    )
-    monkeypatch.setattr(multistep, "errors", lambda along, *_: many(along.model))
-    monkeypatch.setattr(multistep, "_goal", lambda weights, unknown, start, *_: start + 1.0)
-    begun = RULE.prior.write(MODEL, jnp.zeros(1))
-    done = multistep.finish(begun, RULE, PATH, DATA, np.ones(4, bool)).model
-    assert float(RULE.prior.read(done)[0]) == pytest.approx(0.5)
+FINISHED = {  # errors at 0.25, 0.5 and 1 s of a parameter z whose step is always 1, and where it ends
+    "a step is halved until the errors fall": (lambda z: 0.01 + abs(z - 0.5) * np.ones(3), 0.5),
+    "one that only bends the first half second": (lambda z: 1 + z * np.array([-0.5, -0.5, 1.5]), 0.0),
+}
 
 
-def test_a_step_that_only_bends_the_first_half_second_is_not_taken(monkeypatch):
-    """Errors at 0.25 and 0.5 s fall to a half with the step, those at 1 s grow by three halves."""
-    size = lambda model: float(RULE.prior.read(model)[0])  # noqa: E731
+@pytest.mark.parametrize(("size", "end"), FINISHED.values(), ids=FINISHED)
+def test_a_gauss_newton_step(monkeypatch, size, end):
+    """Of which nothing more is taken than what makes the errors fall."""
 
-    def many(model, horizons):
-        scale = np.array([1 - 0.5 * size(model), 1 - 0.5 * size(model), 1 + 1.5 * size(model)])[: len(horizons)]
+    def errors(along, horizons):
+        scale = size(float(RULE.prior.read(along.model)[0]))[: len(horizons)]
         return np.broadcast_to(scale[:, None], (4, 3, len(horizons), 1))
 
     one = np.ones((4, 3, 2, 1, RULE.weights(MODEL).nodes.size + 1))
     monkeypatch.setattr(multistep, "followed", _followed)
-    monkeypatch.setattr(multistep, "open_loop", lambda along, *_: OpenLoop(many(along.model, (0, 0)), one, np.ones(2)))
-    monkeypatch.setattr(multistep, "errors", lambda along, horizons: many(along.model, horizons))
+    monkeypatch.setattr(multistep, "open_loop", lambda along, *_: OpenLoop(errors(along, (0, 0)), one, np.ones(2)))
+    monkeypatch.setattr(multistep, "errors", errors)
     monkeypatch.setattr(multistep, "_goal", lambda weights, unknown, start, *_: start + 1.0)
-    begun = RULE.prior.write(MODEL, jnp.zeros(1))
-    done = multistep.finish(begun, RULE, PATH, DATA, np.ones(4, bool)).model
-    assert float(RULE.prior.read(done)[0]) == 0.0
+    done = multistep.finish(RULE.prior.write(MODEL, jnp.zeros(1)), RULE, PATH, DATA, np.ones(4, bool)).model
+    assert float(RULE.prior.read(done)[0]) == pytest.approx(end)
 
 
 @pytest.mark.parametrize("shaped", [False, True])
 def test_a_shaped_finish_adds_the_prior_of_friction_and_nothing_to_parameters(monkeypatch, shaped):
     nodes, asked = RULE.weights(MODEL).nodes.size, []
-    columns = np.ones((4, 3, 2, 1, nodes + 1))
-    prediction = OpenLoop(np.ones((4, 3, 2, 1)), columns, np.ones(2))
-    monkeypatch.setattr(multistep, "followed", _followed)
-    monkeypatch.setattr(multistep, "open_loop", lambda *_: prediction)
-    monkeypatch.setattr(multistep, "errors", lambda *_: prediction.error)
-    monkeypatch.setattr(
-        multistep, "friction_prior", lambda *_: (np.full((nodes + 1,) * 2, 7.0), np.full(nodes + 1, 3.0))
-    )
-    monkeypatch.setattr(multistep, "_goal", lambda *arguments: asked.append(arguments[-2:]) or arguments[2])
+    prediction = OpenLoop(np.ones((4, 3, 2, 1)), np.ones((4, 3, 2, 1, nodes + 1)), np.ones(2))
+    fakes = {"followed": _followed, "open_loop": lambda *_: prediction, "errors": lambda *_: prediction.error}
+    fakes["friction_prior"] = lambda *_: (np.full((nodes + 1,) * 2, 7.0), np.full(nodes + 1, 3.0))
+    fakes["_goal"] = lambda *arguments: asked.append(arguments[-2:]) or arguments[2]
+    for name, value in fakes.items():
+        monkeypatch.setattr(multistep, name, value)
     multistep.finish(MODEL, RULE, PATH, DATA, np.ones(4, bool), shaped=shaped)
     ((score, information),) = asked
     weight = multistep.weighed(prediction, np.ones(4, bool)).sum()
@@ -290,11 +257,8 @@ def test_recordings_that_disagree_and_forces_unsaid_widen_a_posterior_but_not_it
     nodes = RULE.weights(MODEL).nodes.size
     columns = slope * np.concatenate([np.zeros((*errors.shape, nodes)), np.ones((*errors.shape, 1))], axis=-1)
     pushed = np.broadcast_to([1.0, 0.0, 2.0], (*errors.shape, 3))
-    prediction, every, likelihood = (
-        OpenLoop(errors, np.concatenate([columns, pushed], axis=-1), np.ones(2)),
-        np.ones(4, bool),
-        50,
-    )
+    prediction = OpenLoop(errors, np.concatenate([columns, pushed], axis=-1), np.ones(2))
+    every, likelihood = np.ones(4, bool), 50
     monkeypatch.setattr(stated, "discrepancy_columns", lambda *_, **__: None)
     monkeypatch.setattr(stated, "followed", lambda *_: None)
     monkeypatch.setattr(stated, "open_loop", lambda *_: prediction)
@@ -322,25 +286,19 @@ def test_a_single_recording_counts_as_blocks_longer_than_its_errors_correlate(ro
     np.testing.assert_allclose(stated.clustered(both, np.array([1.0, 2.0])), both.sum(axis=1))
 
 
-def _left(rng, tau: float) -> stated.Errors:
-    """Errors of one parameter, forces of a size, and noise of weight 4."""
-    own, other = rng.normal(size=(2000, 1)), rng.normal(size=(2000, 60)) / np.sqrt(np.arange(1, 61))
-    error = own[:, 0] + tau * other @ rng.normal(size=60) + 0.5 * rng.normal(size=2000)
-    return stated.Errors(error, own, other, np.full(2000, 4.0), 2000.0)
-
-
-@pytest.mark.parametrize("tau", [0.03, 0.3])
+@pytest.mark.parametrize("tau", [0.0, 0.03, 0.3])
 def test_the_size_of_forces_unsaid_is_that_which_made_the_errors(tau):
-    rng = np.random.default_rng(0)
-    sizes = [stated.size(case, 1.0 + 4.0 * case.own.T @ case.own) for case in (_left(rng, tau) for _ in range(8))]
-    assert np.mean(sizes) == pytest.approx(tau, rel=0.1)
-
-
-def test_noise_alone_tells_of_no_forces():
-    rng = np.random.default_rng(1)
-    sizes = [stated.size(case, 1.0 + 4.0 * case.own.T @ case.own) for case in (_left(rng, 0.0) for _ in range(8))]
-    assert min(sizes) == 0.0  # in half of the cases some is likelier by chance
-    assert max(sizes) < 3 * 0.5 / np.sqrt(2000)  # how well the size of one force is told
+    """Errors of one parameter, forces of a size, and noise of weight 4; noise alone tells of no forces."""
+    rng, sizes = np.random.default_rng(0), []
+    for _ in range(8):
+        own, other = rng.normal(size=(2000, 1)), rng.normal(size=(2000, 60)) / np.sqrt(np.arange(1, 61))
+        error = own[:, 0] + tau * other @ rng.normal(size=60) + 0.5 * rng.normal(size=2000)
+        left = stated.Errors(error, own, other, np.full(2000, 4.0), 2000.0)
+        sizes.append(stated.size(left, 1.0 + 4.0 * own.T @ own))
+    if tau:
+        assert np.mean(sizes) == pytest.approx(tau, rel=0.1)
+    else:  # in half of the cases some is likelier by chance; how well the size of one force is told
+        assert min(sizes) == 0.0 and max(sizes) < 3 * 0.5 / np.sqrt(2000)
 
 
 def test_forces_unsaid_are_as_large_as_asked_at_every_state():
@@ -348,10 +306,8 @@ def test_forces_unsaid_are_as_large_as_asked_at_every_state():
     rng = np.random.default_rng(2)
     path = Gaussian(jnp.asarray(rng.normal(size=(4, 9, 2))), PATH.cov)
     weights = RULE.weights(MODEL)
-    many = [
-        stated.discrepancy_columns(MODEL, weights, path, DATA, np.ones(4, bool), key=jax.random.key(i)).force
-        for i in range(20)
-    ]
+    columns = lambda i: stated.discrepancy_columns(MODEL, weights, path, DATA, np.ones(4, bool), key=jax.random.key(i))  # noqa: E731
+    many = [columns(i).force for i in range(20)]
     variance = np.mean([np.sum(np.square(force), axis=1) for force in many], axis=0)
     np.testing.assert_allclose(variance, float(weights.asymmetry[0]) ** 2, rtol=0.2)
 
@@ -365,9 +321,20 @@ class _CurvatureRule(NamedTuple):
         return None, SimpleNamespace(hessian=jnp.full((1, 1), _mass(model)), used=np.arange(4) < 3)
 
 
-def _finished(monkeypatch, error, white=False):
-    """The outcome, `error` being that of a sequence by whether its model was fitted to it; the last one is lost."""
-    used, masks = np.array([True, True, True, False]), []
+FINISHES = {  # errors of what was fitted and of what was left out, and whether readings are white
+    "that only the fitted sequences like": (0.1, 1.2, False),
+    "that only they like, and white readings": (0.1, 1.2, True),
+    "that helps what is left out": (0.5, 0.5, False),
+    "that helps, and white readings": (0.5, 0.5, True),
+}
+
+
+@pytest.mark.parametrize(("inside", "outside", "white"), FINISHES.values(), ids=FINISHES)
+def test_a_finish(monkeypatch, inside, outside, white):
+    """It is left alone or done on all.  White readings prove the sensor, not the physics: only where no finish helps is
+    likelihood efficient, and its posterior not widened.
+    """
+    used, masks = np.array([True, True, True, False]), []  # the last one is lost
 
     def finish(model, m_step, path, data, mask, shaped):
         masks.append(mask)
@@ -375,7 +342,7 @@ def _finished(monkeypatch, error, white=False):
 
     def errors(along, *_):
         place = round(_mass(along.model)) - 11
-        each = np.ones(4) if place < 0 else np.array([error(fitted) for fitted in masks[place]])
+        each = np.ones(4) if place < 0 else np.where(masks[place], inside, outside)
         return each[:, None, None, None] * np.array([0.9, 1.0, 1.1])[None, :, None, None]
 
     fakes = {"white_readings": lambda *_: white, "not_diverged": lambda *_: used, "finish": finish, "errors": errors}
@@ -384,29 +351,16 @@ def _finished(monkeypatch, error, white=False):
     fakes["widened"] = lambda *args, key: stated.Stated(2 * args[-1], 0.7)
     for name, value in fakes.items():
         monkeypatch.setattr(identify, name, value)
-    smoother = SimpleNamespace(tolerant=lambda: None)
-    rule = _CurvatureRule(RULE.prior)
+    rule, smoother = _CurvatureRule(RULE.prior), SimpleNamespace(tolerant=lambda: None)
     fitted = Identified(None, _state([0.0])._replace(hessian=jnp.ones((1, 1))), rule, None, smoother)
-    return fitted, identify.finished(fitted, DATA), masks
-
-
-def test_a_finish_that_only_the_fitted_sequences_like_is_left_alone(monkeypatch):
-    fitted, after, masks = _finished(monkeypatch, lambda fitted: 0.1 if fitted else 1.2)
-    assert after.model is fitted.model
-    assert float(after.state.hessian[0, 0]) == 2.0 and after.discrepancy == 0.7
+    after = identify.finished(fitted, DATA)
+    if outside < 1:
+        np.testing.assert_array_equal(masks[-1], used)
+        assert _mass(after.model) == 10.0 + len(masks)
+        assert float(after.state.hessian[0, 0]) == 2 * _mass(after.model), "the curvature is that of other weights"
+        np.testing.assert_array_equal(after.state.top, 3 * [_mass(after.model)] + [np.nan])  # the likelihood, too
+        return
     np.testing.assert_array_equal(np.sum(masks, axis=0), [1, 1, 1, 0])  # each left out once
-
-
-def test_white_readings_spare_the_wider_posterior_and_no_finish(monkeypatch):
-    """White readings prove the sensor, not the physics: only where no finish helps is likelihood efficient."""
-    fitted, after, _ = _finished(monkeypatch, lambda fitted: 0.1 if fitted else 1.2, white=True)
-    assert after.state is fitted.state and after.discrepancy == fitted.discrepancy
-
-
-@pytest.mark.parametrize("white", [False, True])
-def test_a_finish_that_helps_what_is_left_out_is_done_on_all(monkeypatch, white):
-    _, after, masks = _finished(monkeypatch, lambda fitted: 0.5, white)
-    np.testing.assert_array_equal(masks[-1], [True, True, True, False])
-    assert _mass(after.model) == 10.0 + len(masks)
-    assert float(after.state.hessian[0, 0]) == 2 * _mass(after.model), "the curvature is that of other weights"
-    np.testing.assert_array_equal(after.state.top, 3 * [_mass(after.model)] + [np.nan])  # the likelihood, too
+    assert after.model is fitted.model and (after.state is fitted.state) == white
+    assert after.discrepancy == (fitted.discrepancy if white else 0.7)
+    assert float(after.state.hessian[0, 0]) == (1.0 if white else 2.0)

@@ -2,13 +2,13 @@
 
 import sys
 import warnings
-from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 import scipy.io
+from helpers import swing_rig
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -16,11 +16,10 @@ from nnap_em.commands.common import write_states
 from nnap_em.data.dataset import DataError
 from nnap_em.data.formats import read_table, write_csv
 from nnap_em.data.logs import read_logs
-from nnap_em.data.rig import Rig
 from nnap_em.storage.files import StoreError
 from nnap_em.systems import specs
 
-RIG = Rig("bench", "acrobot", {}, True, ("u",), (2,), 0.01, "sequence", ("theta1", "dtheta1"), {}, {})
+RIG = swing_rig()
 
 
 def _log(rows: int = 50) -> dict[str, np.ndarray]:
@@ -30,24 +29,13 @@ def _log(rows: int = 50) -> dict[str, np.ndarray]:
     return {"time": t, "u": np.cos(t), "theta1": theta, "dtheta1": 3 * np.cos(3 * t)}
 
 
-def _parquet(path: Path, columns) -> None:
-    pq.write_table(pa.table(columns), path)
-
-
-def _struct(path: Path, columns) -> None:
-    scipy.io.savemat(path, {"run1": columns}, oned_as="column")
-
-
-def _mat(path: Path, columns) -> None:
-    scipy.io.savemat(path, columns, oned_as="row")
-
-
 WRITERS = {
     "csv": (".csv", write_csv),
-    "parquet": (".parquet", _parquet),
-    "mat": (".mat", _mat),
-    "struct": (".mat", _struct),
+    "parquet": (".parquet", lambda path, columns: pq.write_table(pa.table(columns), path)),
+    "mat": (".mat", lambda path, columns: scipy.io.savemat(path, columns, oned_as="row")),
+    "struct": (".mat", lambda path, columns: scipy.io.savemat(path, {"run1": columns}, oned_as="column")),
 }
+OTHERS = dict([WRITERS["parquet"], WRITERS["mat"]])
 
 
 @pytest.mark.parametrize("t0", (0.0, 12.3, 1.7e9))
@@ -75,24 +63,24 @@ def test_a_log_is_the_same_in_every_format(tmp_path, suffix, write):
 _values = st.floats(allow_infinity=False, allow_subnormal=False)
 
 
-@pytest.mark.parametrize("suffix, write", [WRITERS["parquet"], WRITERS["mat"]], ids=["parquet", "mat"])
+@pytest.mark.parametrize("suffix", OTHERS)
 @settings(deadline=None, max_examples=40)  # it writes files
 @given(rows=st.lists(st.tuples(_values, _values), min_size=2, max_size=30))
-def test_any_finite_table_comes_back_to_the_bit(tmp_path_factory, suffix, write, rows):
+def test_any_finite_table_comes_back_to_the_bit(tmp_path_factory, suffix, rows):
     path = tmp_path_factory.getbasetemp() / f"written{suffix}"
     a, b = np.array(rows).T
-    write(path, {"time": np.arange(len(rows), dtype=float), "a": a, "b": b})
+    OTHERS[suffix](path, {"time": np.arange(len(rows), dtype=float), "a": a, "b": b})
     np.testing.assert_array_equal(read_table(path, ("time",), ("b", "a"))[:, 1:].T, [b, a])
 
 
-@pytest.mark.parametrize("suffix, write", [WRITERS["parquet"], WRITERS["mat"]], ids=["parquet", "mat"])
+@pytest.mark.parametrize("suffix", OTHERS)
 @settings(deadline=None, max_examples=30)  # it writes files
 @given(row=st.integers(0, 49), name=st.sampled_from(list(_log())), bad=st.sampled_from([np.inf, -np.inf, np.nan]))
-def test_any_corrupted_field_is_named_with_its_row_and_column(tmp_path_factory, suffix, write, row, name, bad):
+def test_any_corrupted_field_is_named_with_its_row_and_column(tmp_path_factory, suffix, row, name, bad):
     path = tmp_path_factory.getbasetemp() / f"corrupted{suffix}"
     columns = _log()
     columns[name][row] = bad
-    write(path, columns)
+    OTHERS[suffix](path, columns)
     if np.isnan(bad) and "theta" in name:
         assert np.isnan(read_table(path, ("time", "u"), ("theta1", "dtheta1"))[row]).any()
         return
@@ -101,58 +89,44 @@ def test_any_corrupted_field_is_named_with_its_row_and_column(tmp_path_factory, 
     assert f"row {row + 1}, column {name!r}: found {bad:g}; write a number" in str(refused.value)
 
 
-def _shorter(columns):
-    return columns | {"u": columns["u"][:-1]}
-
-
-MISTAKES = {  # name: (suffix, the bytes or the columns, then the words of the message)
-    "parquet: column missing": (".parquet", lambda c: {n: c[n] for n in ("time", "theta1", "dtheta1")}, "'u': missing"),
-    "parquet: text": (".parquet", lambda c: c | {"u": ["0.1"] * 50}, "column 'u'", "holds object", "floating point"),
-    "parquet: one row": (".parquet", lambda c: {n: v[:1] for n, v in c.items()}, "found 1 row;", "2 rows or more"),
-    "parquet: no such file": (".parquet", b"PAR1 and nothing", "no Parquet file, or damaged", "another copy"),
-    "parquet: empty": (".parquet", b"", "no Parquet file, or damaged", "another copy"),
-    "parquet: gap": (
-        ".parquet",
-        lambda c: {n: np.delete(v, slice(9, 39)) for n, v in c.items()},
-        "row 10, column 'time'",
-        "a gap",
-    ),
-    "mat: column misspelt": (".mat", lambda c: {n.replace("dth", "d_th"): v for n, v in c.items()}, "did you mean"),
-    "mat: another length": (".mat", _shorter, "column 'u'", "is 49, the first has 50 rows", "one length"),
-    "mat: a matrix": (".mat", lambda c: c | {"u": np.ones((50, 2))}, "column 'u'", "missing", "u[0], u[1]"),
-    "mat: complex": (".mat", lambda c: c | {"u": c["u"] + 1j}, "column 'u'", "holds complex128, no numbers"),
-    "mat: text": (".mat", lambda c: c | {"u": "0.1"}, "column 'u'", "no numbers", "floating point"),
-    "mat: cut short": (".mat", b"MATLAB 5.0 MAT-file, Platform" + 40 * b" ", "no MAT file, or damaged", "another copy"),
-    "mat: noise": (".mat", bytes(range(256)) * 4, "no MAT file, or damaged", "as CSV"),
-    "mat: version 7.3": (".mat", b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM" + b"\x89HDF" * 99, "7.3", "'-v7'"),
+MISTAKES = {  # name, which begins with the suffix: (the bytes or the columns, then the words of the message)
+    "parquet: column missing": (lambda c: {n: c[n] for n in ("time", "theta1", "dtheta1")}, "'u': missing"),
+    "parquet: text": (lambda c: c | {"u": ["0.1"] * 50}, "column 'u' | holds object | floating point"),
+    "parquet: one row": (lambda c: {n: v[:1] for n, v in c.items()}, "found 1 row; | 2 rows or more"),
+    "parquet: no such file": (b"PAR1 and nothing", "no Parquet file, or damaged | another copy"),
+    "parquet: gap": (lambda c: {n: np.delete(v, slice(9, 39)) for n, v in c.items()}, "row 10, column 'time' | a gap"),
+    "mat: column misspelt": (lambda c: {n.replace("dth", "d_th"): v for n, v in c.items()}, "did you mean"),
+    "mat: another length": (lambda c: c | {"u": c["u"][:-1]}, "column 'u' | is 49, the first has 50 rows | one length"),
+    "mat: a matrix": (lambda c: c | {"u": np.ones((50, 2))}, "column 'u' | missing | u[0], u[1]"),
+    "mat: complex": (lambda c: c | {"u": c["u"] + 1j}, "column 'u' | holds complex128, no numbers"),
+    "mat: text": (lambda c: c | {"u": "0.1"}, "column 'u' | no numbers | floating point"),
+    "mat: cut short": (b"MATLAB 5.0 MAT-file, Platform" + 40 * b" ", "no MAT file, or damaged | another copy"),
+    "mat: version 7.3": (b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM" + b"\x89HDF" * 99, "7.3 | '-v7'"),
 }
 
 
-@pytest.mark.parametrize("suffix, content, words", [(s, c, w) for s, c, *w in MISTAKES.values()], ids=MISTAKES)
-def test_a_mistake_is_refused(tmp_path, suffix, content, words):
-    path = tmp_path / f"01{suffix}"
+@pytest.mark.parametrize("name", MISTAKES)
+def test_a_mistake_is_refused(tmp_path, name):
+    content, words = MISTAKES[name]
+    path = tmp_path / f"01.{name.partition(':')[0]}"
     if isinstance(content, bytes):
         path.write_bytes(content)
     else:
-        dict([WRITERS["parquet"], WRITERS["mat"]])[suffix](path, content(_log()))
+        OTHERS[path.suffix](path, content(_log()))
     with pytest.raises(DataError) as refused, warnings.catch_warnings(action="ignore"):
         read_logs(tmp_path, RIG)
-    for word in (str(path), *words):
+    for word in (str(path), *words.split(" | ")):
         assert word in str(refused.value)
 
 
-def test_without_the_extra_the_message_names_it(tmp_path, monkeypatch):
+def test_only_parquet_needs_an_extra(tmp_path, monkeypatch):
+    """scipy, which reads MAT files, comes with JAX."""
     monkeypatch.setitem(sys.modules, "pyarrow", None)
-    (tmp_path / "01.parquet").write_bytes(b"any")
+    OTHERS[".mat"](tmp_path / "01.mat", _log())
+    assert read_logs(tmp_path, RIG).files == ("01.mat",)
+    (tmp_path / "02.parquet").write_bytes(b"any")
     with pytest.raises(DataError, match=r"cannot be read without pyarrow; pip install 'nnap-em\[formats\]'"):
         read_logs(tmp_path, RIG)
-
-
-def test_a_mat_file_needs_no_extra(tmp_path, monkeypatch):
-    """scipy comes with JAX."""
-    monkeypatch.setitem(sys.modules, "pyarrow", None)
-    _mat(tmp_path / "01.mat", _log())
-    assert read_logs(tmp_path, RIG).files == ("01.mat",)
 
 
 def test_whole_numbers_single_precision_and_nulls_are_read(tmp_path):
@@ -163,23 +137,17 @@ def test_whole_numbers_single_precision_and_nulls_are_read(tmp_path):
     np.testing.assert_array_equal(rows.T, [np.arange(50), [np.nan, *range(49)], np.arange(50)])
 
 
-def test_predictions_of_such_logs_are_csv_files(tmp_path):
-    (tmp_path / "logs").mkdir()
-    _parquet(tmp_path / "logs/01.parquet", _log())
-    logs = read_logs(tmp_path / "logs", RIG)
-    values = np.zeros((1, 50, 4))
-    write_states(tmp_path / "out", logs, specs["acrobot"].states, values, values)
-    assert [path.name for path in (tmp_path / "out").iterdir()] == ["01.csv"]
-    write_states(tmp_path / "out", logs, specs["acrobot"].states, values, values)  # its own files are replaced
-
-
-def test_states_never_replace_a_log(tmp_path):
-    """Nothing is written beside a file that would be lost, either."""
+def test_states_replace_their_own_files_and_never_a_log(tmp_path):
+    """Those of such logs are CSV files; nothing is written beside a file that would be lost, either."""
     for name in ("01", "02"):
-        write_csv(tmp_path / f"{name}.csv", _log())
-    logs = read_logs(tmp_path, RIG)
-    (tmp_path / "01.csv").unlink()
-    log = (tmp_path / "02.csv").read_text()
+        OTHERS[".parquet"](tmp_path / f"{name}.parquet", _log())
+    logs, values, out = read_logs(tmp_path, RIG), np.zeros((2, 50, 4)), tmp_path / "out"
+    write_states(out, logs, specs["acrobot"].states, values, values)
+    assert sorted(path.name for path in out.iterdir()) == ["01.csv", "02.csv"]
+    write_states(out, logs, specs["acrobot"].states, values, values)
+    (out / "01.csv").unlink()
+    write_csv(out / "02.csv", _log())
+    log = (out / "02.csv").read_text()
     with pytest.raises(StoreError, match=r"02\.csv: is there already, and nnap_em did not write it; move it away"):
-        write_states(tmp_path, logs, specs["acrobot"].states, np.zeros((2, 50, 4)), np.zeros((2, 50, 4)))
-    assert [path.read_text() for path in tmp_path.iterdir()] == [log]
+        write_states(out, logs, specs["acrobot"].states, values, values)
+    assert [path.read_text() for path in out.iterdir()] == [log]

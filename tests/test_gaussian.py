@@ -18,27 +18,29 @@ def _spd(dim: int, seed: int, condition: float = 1e3) -> np.ndarray:
 
 
 @pytest.mark.parametrize("dim", [1, 2, 4, 8, 12])
-def test_cholesky_is_numpys(dim):
-    a = _spd(dim, dim)
-    factor = np.asarray(lower(cholesky(jnp.asarray(a))))
+def test_spd_solve_is_numpys(dim):
+    """With its factor and its product; unrolled, and beyond `WIDE` in loops."""
+    a, b = _spd(dim, dim), np.random.default_rng(9).normal(size=(dim, 3))
+
+    @jax.jit
+    def run(a, b):
+        factor, one = cholesky(a), b[:, 0]
+        solved = spd_solve(a, b), spd_solve(a, one), upper_solve(factor, b)
+        return lower(factor), solved, (product(a, b), product(a, one))
+
+    factor, solved, products = run(a, b)
     # backward error (dim + 1) eps |a|, forward error that times the condition number [Higham 2002, thm 10.3]
     np.testing.assert_allclose(factor @ factor.T, a, atol=(dim + 1) * EPS * np.linalg.norm(a))
     np.testing.assert_allclose(factor, np.linalg.cholesky(a), atol=(dim + 1) * EPS * 1e3 * np.linalg.norm(a) ** 0.5)
     assert np.all(np.triu(factor, 1) == 0)
-
-
-@pytest.mark.parametrize("dim", [1, 2, 4, 8, 12])
-def test_spd_solve_is_numpys(dim):
-    a = _spd(dim, dim)
-    b = np.random.default_rng(9).normal(size=(dim, 3))
-    tolerance = {
-        "rtol": 0.0,
-        "atol": 10 * dim * EPS * 1e3 * np.abs(np.linalg.solve(a, b)).max(),
-    }  # condition number 1e3
-    np.testing.assert_allclose(spd_solve(jnp.asarray(a), jnp.asarray(b)), np.linalg.solve(a, b), **tolerance)
-    np.testing.assert_allclose(
-        spd_solve(jnp.asarray(a), jnp.asarray(b[:, 0])), np.linalg.solve(a, b[:, 0]), **tolerance
-    )
+    exact = np.linalg.solve(a, b)
+    tolerance = 10 * dim * EPS * 1e3 * np.abs(exact).max()  # condition number 1e3
+    np.testing.assert_allclose(solved[0], exact, rtol=0.0, atol=tolerance)
+    np.testing.assert_allclose(solved[1], exact[:, 0], rtol=0.0, atol=tolerance)
+    upper = np.linalg.solve(np.linalg.cholesky(a).T, b)
+    np.testing.assert_allclose(solved[2], upper, rtol=1e-8, atol=1e-8)
+    np.testing.assert_allclose(products[0], a @ b, rtol=1e-10, atol=1e-10)
+    np.testing.assert_allclose(products[1], a @ b[:, 0], rtol=1e-10, atol=1e-10)
 
 
 def test_spd_solve_has_the_derivative_of_the_inverse():
@@ -68,14 +70,3 @@ def test_nothing_asks_lapack(dim):
 
     program = str(jax.make_jaxpr(jax.vmap(all_of_it))(jnp.zeros((3, dim, dim))))
     assert "cholesky[" not in program and "triangular_solve[" not in program
-
-
-@pytest.mark.parametrize("dim", [4, 12])
-def test_product_and_upper_solve_are_numpys(dim):
-    """Unrolled, and beyond `WIDE` in loops."""
-    a, b = _spd(dim, dim), np.random.default_rng(3).normal(size=(dim, 2))
-    np.testing.assert_allclose(product(jnp.asarray(a), jnp.asarray(b)), a @ b, rtol=1e-10, atol=1e-10)
-    np.testing.assert_allclose(product(jnp.asarray(a), jnp.asarray(b[:, 0])), a @ b[:, 0], rtol=1e-10, atol=1e-10)
-    factor = np.linalg.cholesky(a)
-    solution = upper_solve(cholesky(jnp.asarray(a)), jnp.asarray(b))
-    np.testing.assert_allclose(solution, np.linalg.solve(factor.T, b), rtol=1e-8, atol=1e-8)  # condition number 1e3

@@ -1,13 +1,13 @@
 """Inputs that go on from row to row: closed forms, and scipy's simulation of linear systems (`lsim`)."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import rig_text, slide
-from scipy.integrate import solve_ivp
 from scipy.signal import lsim
 
 from nnap_em.data.dataset import Dataset, pad
@@ -37,7 +37,8 @@ def _log(u) -> Dataset:
 
 def _run(model, u):
     step = lambda x, inputs: (model.transition(x, inputs), x)  # noqa: E731
-    return np.asarray(jax.lax.scan(step, jnp.asarray([0.1, -0.2]), model.inputs(_log(u)))[1])
+    along = jax.jit(lambda seq: jax.lax.scan(step, jnp.asarray([0.1, -0.2]), model.inputs(seq))[1])
+    return np.asarray(along(_log(u)))
 
 
 def _signal(rows=ROWS):
@@ -69,24 +70,25 @@ def test_a_sine_loses_nothing_between_its_rows():
 
 def test_padding_and_horizons_end_the_course():
     u, model = _signal(), _model()
-    whole, short = model.inputs(_log(u)), _log(u[:20])
     padded = _log(np.append(u[:20], np.zeros(5)))._replace(valid=jnp.arange(25) < 20)
-    a, b = model.inputs(short).course, model.inputs(padded).course
-    np.testing.assert_array_equal(a[:19], b[:19])
-    np.testing.assert_array_equal(a[:18], whole.course[:18])
+    courses = jax.jit(lambda *logs: [model.inputs(log).course for log in logs])
+    short, padded, whole = courses(_log(u[:20]), padded, _log(u))
+    np.testing.assert_array_equal(short[:19], padded[:19])
+    np.testing.assert_array_equal(short[:18], whole[:18])
 
 
 def test_a_lag_is_that_of_the_line_between_rows():
     """tau y' = u - y, at rest with the input before the first row."""
     lag, u = catalogue["actuator_lag"].of(0.13, joint=1), _signal()
     _, y, _ = lsim(([[-1 / 0.13]], [[1 / 0.13]], [[1.0]], [[0.0]]), u, DT * np.arange(ROWS), X0=[u[0]], interp=True)
-    np.testing.assert_allclose(LINES.through(lag, jnp.asarray(u)), y, atol=1e-12)
+    np.testing.assert_allclose(jax.jit(lambda u: LINES.through(lag, u))(u), y, atol=1e-12)
 
 
-@pytest.mark.parametrize("delay", [0.0, 0.02, 0.05, 0.12])
-def test_a_delay_moves_the_line(delay):
-    late, u, t = catalogue["input_delay"].of(delay, joint=1), _signal(), DT * np.arange(ROWS)
-    np.testing.assert_allclose(LINES.through(late, jnp.asarray(u)), np.interp(t - delay, t, u), atol=1e-12)
+def test_a_delay_moves_the_line():
+    u, t, delays = _signal(), DT * np.arange(ROWS), (0.0, 0.02, 0.05, 0.12)
+    laws = [catalogue["input_delay"].of(delay, joint=1) for delay in delays]
+    moved = jax.jit(lambda u: [LINES.through(late, u) for late in laws])(u)
+    np.testing.assert_allclose(moved, [np.interp(t - delay, t, u) for delay in delays], atol=1e-12)
 
 
 @pytest.mark.parametrize("name, number", [("actuator_lag", 0.13), ("input_delay", 0.12), ("motor_gain", 0.1)])
@@ -96,16 +98,21 @@ def test_row_by_row_is_the_whole(name, number):
     stream = hooks.command_stream((effect,), None, system, LINES)
     step = lambda memory, row: stream.step(memory, row[0], row[1])  # noqa: E731
     first = jnp.arange(ROWS) == 0
-    _, found = jax.lax.scan(step, stream.memory, (jnp.asarray(u)[:, None], first))
-    np.testing.assert_allclose(found, hooks.reaching((effect,), system, jnp.asarray(u)[:, None], LINES), atol=1e-12)
+    found, whole = jax.jit(
+        lambda u: (
+            jax.lax.scan(step, stream.memory, (u, first))[1],
+            hooks.reaching((effect,), system, u, LINES),
+        )
+    )(jnp.asarray(u)[:, None])
+    np.testing.assert_allclose(found, whole, atol=1e-12)
 
 
 def test_a_late_sensor_reads_the_line_before_its_row():
     """The position `delay` ago, by the closed form of a mass under a linear force."""
     delay, u = 0.03, _signal()
     model = _model((catalogue["sensor_delay"].of(delay, channel="x"),))
-    inputs, x, m = model.inputs(_log(u)), _run(model, u), float(model.system.m)
-    read = np.asarray(jax.vmap(model.emission)(jnp.asarray(x), inputs))[1:, 0]
+    x, m = _run(model, u), float(model.system.m)
+    read = jax.jit(lambda x, log: jax.vmap(model.emission)(x, model.inputs(log)))(jnp.asarray(x), _log(u))[1:, 0]
     slope = np.diff(u) / DT
     past = x[1:, 0] - delay * x[1:, 1] + (u[1:] * delay**2 / 2 - slope * delay**3 / 6) / m  # by a line
     np.testing.assert_allclose(read, past, atol=1e-12)
@@ -132,18 +139,29 @@ def test_a_rig_is_read_back_with_its_hold(tmp_path):
     assert rig.input_hold == SMOOTH and read_rig(tmp_path / "again.toml", specs) == rig
 
 
-def _recordings(force, rng, delay=0.0):
-    """Slides of 2.1 kg with dry and viscous friction under a force in time, every 40 ms, by scipy."""
+@functools.cache
+def _recordings(hold: str, delay: float = 0.0) -> Dataset:
+    """Slides of 2.1 kg with dry and viscous friction under a force in time, every 40 ms, by Runge-Kutta steps."""
+    rng, h, rows = np.random.default_rng(3), 0.002, 300
+    size, speed, phase = rng.uniform(2, 5, (4, 3)), rng.uniform(1, 9, (4, 3)), rng.uniform(0, 6, (4, 3))
+    smooth = lambda t: np.sum(size * np.sin(speed * t + phase), axis=1)  # noqa: E731
 
-    def one():
-        size, rate, phase = rng.uniform(2, 5, 3), rng.uniform(1, 9, 3), rng.uniform(0, 6, 3)
-        smooth = lambda t: float(np.sum(size * np.sin(rate * t + phase)))  # noqa: E731
-        t = 0.04 * np.arange(300)
-        move = lambda t, x: [x[1], (force(smooth, t - delay) - np.tanh(x[1] / 0.02) - 1.5 * x[1]) / 2.1]  # noqa: E731
-        x = solve_ivp(move, (0, t[-1]), [0.0, 0.0], t_eval=t, rtol=1e-8, atol=1e-10, max_step=0.04).y[0]
-        return t, np.array([[smooth(at)] for at in t]), (x + 3e-4 * rng.normal(size=x.size))[:, None]
+    def rate(t, x):
+        force = FORCES[hold](smooth, t - delay)
+        return np.stack([x[1], (force - np.tanh(x[1] / 0.02) - 1.5 * x[1]) / 2.1])
 
-    return pad([one() for _ in range(4)])
+    x, read = np.zeros((2, 4)), []
+    for k in range(rows):
+        read.append(x[0])
+        for t in 0.04 * k + h * np.arange(20):
+            a = rate(t, x)
+            b = rate(t + h / 2, x + h / 2 * a)
+            c = rate(t + h / 2, x + h / 2 * b)
+            x = x + h / 6 * (a + 2 * b + 2 * c + rate(t + h - 1e-6, x + h * c))  # before the force of the next row
+    t, noise = 0.04 * np.arange(rows), 3e-4 * rng.normal(size=(rows, 4))
+    u = np.stack([smooth(one) for one in t])
+    logs = zip(u.T[..., None], (np.stack(read) + noise).T[..., None], strict=True)
+    return pad([(t, inputs, readings) for inputs, readings in logs])
 
 
 FORCES = {HOLD: lambda smooth, t: smooth(0.04 * np.floor(t / 0.04 + 1e-9)), SMOOTH: lambda smooth, t: smooth(t)}
@@ -154,7 +172,7 @@ FORCES = {HOLD: lambda smooth, t: smooth(0.04 * np.floor(t / 0.04 + 1e-9)), SMOO
 def test_torque_and_motion_show_the_hold(true, declared, tmp_path):
     """They differ by half a row; the line to write is the hold of the truth, and nothing where it is declared."""
     rig = _rig(tmp_path, declared)
-    found = lag(regression(rig, build_system(rig), _recordings(FORCES[true], np.random.default_rng(3))), 0)
+    found = lag(regression(rig, build_system(rig), _recordings(true)), 0)
     expected = {(HOLD, SMOOTH): -0.5, (SMOOTH, HOLD): 0.5}.get((declared, true), 0.0)
     assert abs(found.rows - expected) < 0.05 and found.std < 0.03
     assert found.counts == (true != declared)
@@ -163,7 +181,7 @@ def test_torque_and_motion_show_the_hold(true, declared, tmp_path):
 
 def test_a_late_drive_is_no_hold(tmp_path):
     rig = _rig(tmp_path, SMOOTH)
-    data = _recordings(FORCES[SMOOTH], np.random.default_rng(3), delay=0.07)
+    data = _recordings(SMOOTH, 0.07)
     found = lag(regression(rig, build_system(rig), data), 0)
     assert abs(found.rows - 0.07 / 0.04) < 0.05 and found.counts
     assert "input_delay" in late(rig, found) and "input_hold =" not in late(rig, found)

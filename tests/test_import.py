@@ -13,6 +13,8 @@ from nnap_em.data.formats import read_table, write_csv
 from nnap_em.data.logs import read_logs
 from nnap_em.data.machine import unpacked
 from nnap_em.data.rig import read_rig
+from nnap_em.import_.columns import resolve
+from nnap_em.import_.files import reader
 from nnap_em.import_.segments import Segment, cut
 from nnap_em.import_.signals import Signal, averaged, held, interpolated
 from nnap_em.systems import specs
@@ -46,8 +48,14 @@ def _write(path, t, command_t, command, theta=_theta, joint: str = "joint", **op
 _import = functools.partial(nnap, "import")
 
 
-def _table(path):
-    return read_table(path, ("time", "u"), ("theta1", "dtheta1"))
+def _imported(log, rig, test=0, name: str = "out"):
+    """The folder that an import writes, beside the log."""
+    assert _import(log, "--rig", rig, "--out", log.parent / name, "--test", test) == 0
+    return log.parent / name
+
+
+def _tables(out, part: str = "train") -> list[np.ndarray]:
+    return [read_table(path, ("time", "u"), ("theta1", "dtheta1")) for path in sorted((out / part).iterdir())]
 
 
 def _jittered(rng, end, dt, amount):
@@ -62,9 +70,8 @@ def test_two_clocks_with_jitter_come_to_one_grid(tmp_path):
     t, command_t = _jittered(rng, 20.0, 0.004, 0.8), _jittered(rng, 20.0, 0.0131, 0.8)
     command = rng.normal(size=command_t.size)
     log = _write(tmp_path / "a.mcap", t, command_t, command)
-    assert _import(log, "--rig", _rig(tmp_path), "--out", tmp_path / "out", "--test", 0) == 0
-    table = _table(tmp_path / "out/train/000.csv")
-    document = json.loads((tmp_path / "out/import.json").read_text())
+    (table,) = _tables(out := _imported(log, _rig(tmp_path)))
+    document = json.loads((out / "import.json").read_text())
     start = document["logs"][0]["sequences"][0]["start"] + document["logs"][0]["origin_ns"] * 1e-9 - ns(0) * 1e-9
     at = start + table[:, 0]
     h = np.diff(t).max()
@@ -82,8 +89,8 @@ def test_a_command_that_is_held_between_rows_is_averaged_as_asked(tmp_path):
     command_t = np.sort(np.append(t, t[:-1] + 0.0025))
     command = np.arange(command_t.size, dtype=float)
     log = _write(tmp_path / "a.mcap", t, command_t, command)
-    assert _import(log, "--rig", _rig(tmp_path, 'input = "mean"'), "--out", tmp_path / "out", "--test", 0) == 0
-    u = _table(tmp_path / "out/train/000.csv")[:-1, 1]
+    (table,) = _tables(_imported(log, _rig(tmp_path, 'input = "mean"')))
+    u = table[:-1, 1]
     np.testing.assert_allclose(u, 0.25 * command[:-1:2] + 0.75 * command[1::2], rtol=1e-6)  # stamps are in ns
 
 
@@ -117,8 +124,7 @@ def test_slow_readings_stand_in_their_nearest_rows(tmp_path):
     }
     log = write_mcap(tmp_path / "a.mcap", topics)
     rig = _rig(tmp_path, columns=COLUMNS.replace("/js:position[joint]", "/camera:angle"))
-    assert _import(log, "--rig", rig, "--out", tmp_path / "out", "--test", 0) == 0
-    theta = _table(tmp_path / "out/train/000.csv")[:, 2]
+    theta = _tables(_imported(log, rig))[0][:, 2]
     filled = np.flatnonzero(np.isfinite(theta))
     assert (np.diff(filled) == 4).all() and filled.size > 240
     # straight lines over 0.04 s; taken as they are they would be 0.001 s * 3 rad/s = 0.003 rad off
@@ -141,11 +147,9 @@ def test_sequences_are_cut_at_gaps(tmp_path, readings, commands, rows):
     t = DT * np.arange(1000)
     kept, commanded = (t[(t < a - 1e-9) | (t >= b - 1e-9)] for a, b in (x or (99, 99) for x in (readings, commands)))
     log = _write(tmp_path / "a.mcap", kept, commanded, np.cos(commanded))
-    assert _import(log, "--rig", _rig(tmp_path, "gap = 0.1"), "--out", tmp_path / "out", "--test", 0) == 0
-    files = sorted((tmp_path / "out/train").iterdir())
-    tables = [_table(path) for path in files]
+    tables = _tables(out := _imported(log, _rig(tmp_path, "gap = 0.1")))
     assert [len(table) for table in tables] == pytest.approx(rows, abs=1)  # a gap begins in a row, and ends in one
-    document = json.loads((tmp_path / "out/import.json").read_text())["logs"][0]
+    document = json.loads((out / "import.json").read_text())["logs"][0]
     for table, s in zip(tables, (s for s in document["sequences"] if s["file"]), strict=True):
         at = table[:, 0] + s["start"]
         at += kept[0] if kept[0] < commanded[0] else commanded[0]
@@ -153,9 +157,9 @@ def test_sequences_are_cut_at_gaps(tmp_path, readings, commands, rows):
         valid = np.isfinite(table[:, 2])
         np.testing.assert_allclose(table[valid, 2], np.sin(3 * at[valid]), rtol=0, atol=1e-9)
         assert np.sum(~valid) == s["missing"]["theta1"] == (2 if readings == (3.0, 3.02) else 0)
-    assert any("shorter than 50 rows" in s["why"] for s in document["sequences"]) == (readings == (3.0, 3.5) and
-        commands == (3.6, 5.0))  # fmt: skip
-    read_logs(tmp_path / "out/train", read_rig(tmp_path / "out/rig.toml", specs))
+    short = readings == (3.0, 3.5) and commands == (3.6, 5.0)
+    assert any("shorter than 50 rows" in s["why"] for s in document["sequences"]) == short
+    read_logs(out / "train", read_rig(out / "rig.toml", specs))
 
 
 def test_long_stretches_are_cut_in_equal_parts_and_every_row_is_in_one():
@@ -165,78 +169,65 @@ def test_long_stretches_are_cut_in_equal_parts_and_every_row_is_in_one():
     ]  # fmt: skip
 
 
-@pytest.mark.parametrize("dt, rows", [(0.01, [1750, 1750]), (1.0, [300]), (10.0, [400, 400])])
-def test_sequences_of_a_slow_machine_last_longer(tmp_path, dt, rows):
+def test_sequences_of_a_slow_machine_last_longer(tmp_path):
     """Cut at 30 s, or at 500 rows: 30 s of one row a second would be too short for a fit."""
-    t = dt * np.arange(sum(rows))
-    columns = {"theta1": np.sin(t / dt / 30), "dtheta1": np.cos(t / dt / 30) / dt / 30, "u": np.cos(t / dt / 50)}
-    write_csv(tmp_path / "a.csv", {"time": t} | columns)
-    rig = _rig(tmp_path, text=RIG.replace("dt = 0.01", f"dt = {dt}"), columns="")
-    assert _import(tmp_path / "a.csv", "--rig", rig, "--out", tmp_path / "out", "--test", 0) == 0
-    assert [len(_table(path)) for path in sorted((tmp_path / "out/train").iterdir())] == rows
+    for dt, rows in ((0.01, [1750, 1750]), (1.0, [300]), (10.0, [400, 400])):
+        t = dt * np.arange(sum(rows))
+        columns = {"theta1": np.sin(t / dt / 30), "dtheta1": np.cos(t / dt / 30) / dt / 30, "u": np.cos(t / dt / 50)}
+        write_csv(tmp_path / "a.csv", {"time": t} | columns)
+        rig = _rig(tmp_path, text=RIG.replace("dt = 0.01", f"dt = {dt}"), columns="")
+        assert [len(table) for table in _tables(_imported(tmp_path / "a.csv", rig, name=f"out {dt}"))] == rows
 
 
 def test_a_reading_that_stands_in_several_messages_is_one(tmp_path, capsys):
     """Each stands in 4 messages, between two rows too: nothing is interpolated between a reading and itself."""
     t = DT * np.arange(1000) + 0.003
     log = _write(tmp_path / "a.mcap", t, t, np.cos(t), theta=lambda t: _theta(t[np.arange(t.size) // 4 * 4]))
-    assert _import(log, "--rig", _rig(tmp_path), "--out", tmp_path / "out", "--test", 0) == 0
+    theta = _tables(_imported(log, _rig(tmp_path)))[0][:, 2]
     assert "theta1: each reading stands in 4 messages: 750 repeats are left out" in capsys.readouterr().err
-    theta = _table(tmp_path / "out/train/000.csv")[:, 2]
     read = np.flatnonzero(np.isfinite(theta))
     assert (np.diff(read) == 4).all() and read.size >= 249
     assert np.max(np.abs(theta[read] - _theta(t[read]))) < 1e-5  # 9 digits of a stamp in the file
 
 
-@pytest.mark.parametrize("test, parts", [(1, (3, 1)), (0.5, (2, 2)), (0, (4, 0)), (0.01, (3, 1))])
-def test_the_last_sequences_are_for_the_test(tmp_path, test, parts):
+def test_the_last_sequences_are_for_the_test(tmp_path):
     t = DT * np.arange(1000)
-    log = _write(tmp_path / "a.mcap", t, t, np.cos(t))
-    rig = _rig(tmp_path, "longest = 2.5")
-    assert _import(log, "--rig", rig, "--out", tmp_path / "out", "--test", test) == 0
-    assert tuple(len(list((tmp_path / "out").glob(f"{part}/*.csv"))) for part in ("train", "test")) == parts
-    every = np.concatenate([_table(p)[:, 2] for p in sorted((tmp_path / "out/train").iterdir())])
-    np.testing.assert_allclose(every, _theta(t[: every.size]), rtol=0, atol=1e-9)
+    log, rig = _write(tmp_path / "a.mcap", t, t, np.cos(t)), _rig(tmp_path, "longest = 2.5")
+    for test, parts in ((1, (3, 1)), (0.5, (2, 2)), (0, (4, 0)), (0.01, (3, 1))):
+        out = _imported(log, rig, test, name=f"out {test}")
+        assert tuple(len(list(out.glob(f"{part}/*.csv"))) for part in ("train", "test")) == parts
+        every = np.concatenate([table[:, 2] for table in _tables(out)])
+        np.testing.assert_allclose(every, _theta(t[: every.size]), rtol=0, atol=1e-9)
 
 
-def test_more_test_sequences_than_there_are_is_refused(tmp_path, capsys):
-    t = DT * np.arange(200)
-    log = _write(tmp_path / "a.mcap", t, t, np.cos(t))
-    assert _import(log, "--rig", _rig(tmp_path), "--out", tmp_path / "out", "--test", 1) == 2
-    assert "the logs give 1 sequence, and one is needed to train on" in capsys.readouterr().err
-    assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.parametrize("clock", ("sequence", "session"))
-def test_what_was_simulated_comes_back_from_mcap(tmp_path, clock):
+def test_what_was_simulated_comes_back_from_mcap(tmp_path):
     """The acrobot of `simulate`, three sequences as recordings: the same CSV files to the last digit but one."""
     bench = tmp_path / "bench"
     assert nnap("simulate", bench, "--sequences", 2, "--test", 1, "--steps", 150) == 0
-    text = (bench / "rig.toml").read_text().replace('"sequence"', f'"{clock}"')
-    rig = read_rig(bench / "rig.toml", specs)
-    (tmp_path / "rig.toml").write_text(text + "\n[import]\nshortest = 0.5\n")
-    logs, tables = [], []
-    for i, path in enumerate([*sorted((bench / "train").iterdir()), *sorted((bench / "test").iterdir())]):
-        table = read_table(path, ("time", *rig.input_columns), rig.measured)
-        tables.append(table)
+    text, rig = (bench / "rig.toml").read_text(), read_rig(bench / "rig.toml", specs)
+    n, logs, tables = 1 + len(rig.input_columns), [], []
+    of = lambda folder: [*sorted((folder / "train").iterdir()), *sorted((folder / "test").iterdir())]  # noqa: E731
+    for i, path in enumerate(of(bench)):
+        tables.append(table := read_table(path, ("time", *rig.input_columns), rig.measured))
         stamps = ns(table[:, 0] + 10.0 * i)
-        n = 1 + len(rig.input_columns)
         state = [dict(zip(rig.measured, row.tolist(), strict=True)) for row in table[:, n:]]
         command = [dict(zip(rig.input_columns, row.tolist(), strict=True)) for row in table[:, 1:n]]
         topics = {"/state": (plain_json(), stamps, state), "/command": (plain_json(), stamps, command)}
         logs.append(write_mcap(tmp_path / f"{i}.mcap", topics))
-    assert _import(*logs, "--rig", tmp_path / "rig.toml", "--out", tmp_path / "out", "--test", 1) == 0
-    files = [*sorted((tmp_path / "out/train").iterdir()), *sorted((tmp_path / "out/test").iterdir())]
-    for i, (path, table) in enumerate(zip(files, tables, strict=True)):
-        back = read_table(path, ("time", *rig.input_columns), rig.measured)
-        start = 10.0 * i if clock == "session" else 0.0
-        np.testing.assert_allclose(back[:, 0], table[:, 0] + start, rtol=0, atol=1e-9)
-        np.testing.assert_array_equal(back[:, 1], table[:, 1])  # commands are held, not interpolated
-        # readings at stamps that are rounded to ns: 5e-10 s times 50 rad/s^2
-        np.testing.assert_allclose(back[:, 2:], table[:, 2:], rtol=1e-11, atol=1e-7)
-    written = read_rig(tmp_path / "out/rig.toml", specs)
-    assert written.measured == rig.measured and '"/state:theta1"' in (tmp_path / "out/rig.toml").read_text()
-    read_logs(tmp_path / "out/train", written)
+    for clock in ("sequence", "session"):
+        out = tmp_path / clock
+        (tmp_path / "rig.toml").write_text(text.replace('"sequence"', f'"{clock}"') + "\n[import]\nshortest = 0.5\n")
+        assert _import(*logs, "--rig", tmp_path / "rig.toml", "--out", out, "--test", 1) == 0
+        for i, (path, table) in enumerate(zip(of(out), tables, strict=True)):
+            back = read_table(path, ("time", *rig.input_columns), rig.measured)
+            start = 10.0 * i if clock == "session" else 0.0
+            np.testing.assert_allclose(back[:, 0], table[:, 0] + start, rtol=0, atol=1e-9)
+            np.testing.assert_array_equal(back[:, 1], table[:, 1])  # commands are held, not interpolated
+            # readings at stamps that are rounded to ns: 5e-10 s times 50 rad/s^2
+            np.testing.assert_allclose(back[:, 2:], table[:, 2:], rtol=1e-11, atol=1e-7)
+        written = read_rig(out / "rig.toml", specs)
+        assert written.measured == rig.measured and '"/state:theta1"' in (out / "rig.toml").read_text()
+        read_logs(out / "train", written)
 
 
 def test_hdf5_and_csv_give_the_same_as_mcap(tmp_path):
@@ -248,23 +239,11 @@ def test_hdf5_and_csv_give_the_same_as_mcap(tmp_path):
     tables = []
     for name in ("a.csv", "a.h5", "a.mcap"):
         rig = _rig(tmp_path / name[2:], columns=COLUMNS if name == "a.mcap" else "")
-        assert _import(tmp_path / name, "--rig", rig, "--out", tmp_path / f"out {name}", "--test", 0) == 0
-        tables.append(_table(tmp_path / f"out {name}/train/000.csv"))
+        tables += _tables(_imported(tmp_path / name, rig, name=f"out {name}"))
+    assert len(tables) == 3
     for table in tables:
         np.testing.assert_allclose(table, tables[0], rtol=0, atol=1e-8)  # stamps in ns, at 9 rad/s^2
         np.testing.assert_allclose(table[:, 1], np.cos(t), rtol=1e-11)
-
-
-def test_units_of_a_log_are_scaled(tmp_path):
-    t = DT * np.arange(300)
-    log = _write(tmp_path / "a.mcap", t, t, np.cos(t), theta=lambda t: np.rad2deg(_theta(t)))
-    scaled = COLUMNS.replace('"/js:position[joint]"', '{ from = "/js:position[0]", scale = 0.017453292519943295 }')
-    assert _import(log, "--rig", _rig(tmp_path, columns=scaled), "--out", tmp_path / "out", "--test", 0) == 0
-    np.testing.assert_allclose(_table(tmp_path / "out/train/000.csv")[:, 2], _theta(t), rtol=0, atol=1e-9)
-
-
-def _empty(values):
-    return np.full_like(values, np.nan)
 
 
 T = DT * np.arange(300)
@@ -287,7 +266,11 @@ REFUSED = {  # what is wrong with the rig's table, with the log or the words of 
     "input": ({"more": 'input = "holds"'}, {}, ["[import] input", "did you mean 'hold'"]),
     "gap": ({"more": "gap = -1"}, {}, ["[import] gap", "seconds above 0"]),
     "no overlap": ({}, {"command_t": T + 100}, ["topics '/js' and '/cmd'", "no time in common", "--shift /cmd="]),
-    "all NaN": ({}, {"command": _empty(T)}, ["column 'u'", "0 numbers in 300 messages", "[import.columns]"]),
+    "all NaN": (
+        {},
+        {"command": np.full_like(T, np.nan)},
+        ["column 'u'", "0 numbers in 300 messages", "[import.columns]"],
+    ),
     "dt too fine": ({"text": RIG.replace("0.01\ninput", "0.001\ninput")}, {}, ["is much finer", "write dt = 0.01"]),
     "unknown shift": ({}, {"words": ("--shift", "/jss=1")}, ["--shift /jss: no topic of that name", "mean '/js'?"]),
     "too short": ({"more": "shortest = 100"}, {}, ["has 300 rows", "a sequence needs 10000"]),
@@ -307,34 +290,30 @@ def test_what_cannot_be_imported_is_refused_and_nothing_is_written(tmp_path, cap
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.mcap", "rig.toml"]
 
 
-def test_a_table_in_ms_is_refused_as_check_refuses_it(tmp_path, capsys):
+def test_a_table_in_ms_a_name_that_stands_twice_and_a_folder_that_is_not_empty_are_refused(tmp_path, capsys):
     write_csv(tmp_path / "a.csv", {"time": 1000 * T, "u": np.cos(T), "theta1": _theta(T), "dtheta1": 3 * np.cos(3 * T)})
-    assert _import(tmp_path / "a.csv", "--rig", _rig(tmp_path, columns=""), "--out", tmp_path / "out") == 2
-    assert "the readings, 10 s apart (theta1); one of the two is in ms: write s" in capsys.readouterr().err
-
-
-def test_a_folder_that_is_not_empty_is_left_alone(tmp_path, capsys):
-    log = _write(tmp_path / "a.mcap", T, T, np.cos(T))
-    (tmp_path / "out").mkdir()
-    (tmp_path / "out/mine.txt").write_text("mine")
-    assert _import(log, "--rig", _rig(tmp_path), "--out", tmp_path / "out") == 2
-    assert "out: is there already; give a new folder, or empty this one" in capsys.readouterr().err
-    assert [p.name for p in (tmp_path / "out").iterdir()] == ["mine.txt"]
-
-
-def test_a_name_that_stands_twice_is_asked_for(tmp_path, capsys):
     notes = [{"u": 0.1, "theta1": float(x), "dtheta1": 0.0} for x in _theta(T)]
-    topics = {name: (plain_json(), ns(T), notes) for name in ("/one", "/two")}
-    log = write_mcap(tmp_path / "a.mcap", topics)
-    assert _import(log, "--rig", _rig(tmp_path, columns=""), "--out", tmp_path / "out") == 2
-    assert "column 'u': may be '/one:u' and '/two:u'; write [import.columns] u" in capsys.readouterr().err
+    write_mcap(tmp_path / "b.mcap", {name: (plain_json(), ns(T), notes) for name in ("/one", "/two")})
+    rig, out = _rig(tmp_path, columns=""), tmp_path / "out"
+    for name, said in (
+        ("a.csv", "the readings, 10 s apart (theta1); one of the two is in ms: write s"),
+        ("b.mcap", "column 'u': may be '/one:u' and '/two:u'; write [import.columns] u"),
+    ):
+        assert _import(tmp_path / name, "--rig", rig, "--out", out) == 2
+        assert said in capsys.readouterr().err
+    log = _write(tmp_path / "a.mcap", T, T, np.cos(T))
+    out.mkdir()
+    (out / "mine.txt").write_text("mine")
+    assert _import(log, "--rig", _rig(tmp_path), "--out", out) == 2
+    assert "out: is there already; give a new folder, or empty this one" in capsys.readouterr().err
+    assert [p.name for p in out.iterdir()] == ["mine.txt"]
+    assert _import(log, "--rig", _rig(tmp_path), "--out", tmp_path / "new", "--test", 1) == 2
+    assert "the logs give 1 sequence, and one is needed to train on" in capsys.readouterr().err
+    assert not (tmp_path / "new").exists()
 
 
 def test_a_joint_that_is_called_as_the_column_is_found(tmp_path):
     """As the coordinates of a machine that was read from its file are."""
-    from nnap_em.import_.columns import resolve
-    from nnap_em.import_.files import reader
-
     joints = joint_states(("shoulder", "elbow"), *[np.ones((300, 2))] * 3)
     path = write_mcap(tmp_path / "a.mcap", {"/js": (ros2(*JOINTS), ns(T), joints)})
     columns = resolve(path, reader(path).topics(path), ("elbow",), ("shoulder", "dshoulder"), {})
@@ -343,21 +322,15 @@ def test_a_joint_that_is_called_as_the_column_is_found(tmp_path):
     }  # fmt: skip
 
 
-def test_other_commands_accept_the_table_and_ignore_it(tmp_path):
-    with_table, without = (read_rig(_rig(tmp_path / str(i), columns=c), specs) for i, c in enumerate((COLUMNS, "")))
-    assert with_table == without
-
-
 def test_the_numbers_of_an_import_are_those_of_the_log(tmp_path):
     rng = np.random.default_rng(2)
     t = _jittered(rng, 10.0, 0.01, 0.4)
     t = t[(t < 3) | (t > 4)]
     log = _write(tmp_path / "a.mcap", t, DT * np.arange(1000), np.cos(DT * np.arange(1000)))
-    assert _import(log, "--rig", _rig(tmp_path), "--out", tmp_path / "out", "--test", 1) == 0
-    text = (tmp_path / "out/import.json").read_text()
+    text = (_imported(log, _rig(tmp_path), 1) / "import.json").read_text()
     for part in ("/js", "/cmd", "train/000.csv", "test/000.csv", "header stamp", "log time"):
         assert part in text
-    topic = json.loads((tmp_path / "out/import.json").read_text())["logs"][0]["topics"][0]
+    topic = json.loads(text)["logs"][0]["topics"][0]
     assert topic["rate"] == pytest.approx(100, rel=0.02) and len(topic["gaps"]) == 1
     assert topic["jitter"] == pytest.approx(np.std(np.diff(t)[np.diff(t) < 0.5]), rel=1e-3)
     assert topic["worst"] < 0.01 * 0.45
@@ -366,10 +339,10 @@ def test_the_numbers_of_an_import_are_those_of_the_log(tmp_path):
 def test_what_is_left_of_a_cut_log_is_imported_and_told(tmp_path, capsys):
     log = _write(tmp_path / "a.mcap", T, T, np.cos(T))
     log.write_bytes(log.read_bytes()[: log.stat().st_size // 2])
-    assert _import(log, "--rig", _rig(tmp_path), "--out", tmp_path / "out", "--test", 0) == 0
+    out = _imported(log, _rig(tmp_path))
     assert "warning: a.mcap: the file is cut short" in capsys.readouterr().err
-    assert "the file is cut short" in (tmp_path / "out/import.json").read_text()
-    u = _table(tmp_path / "out/train/000.csv")[:, 1]
+    assert "the file is cut short" in (out / "import.json").read_text()
+    u = _tables(out)[0][:, 1]
     assert 50 < u.size < 300
     np.testing.assert_allclose(u, np.cos(T[: u.size]), rtol=1e-11)
 

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -47,23 +48,27 @@ FORMS = {
 """A law and its level [N m] as Duclusaud et al. have it, with their external torque as minus the weight."""
 
 
-@pytest.fixture
-def model(tmp_path) -> StateSpaceModel:
+@pytest.fixture(scope="module")
+def model(tmp_path_factory) -> StateSpaceModel:
     """The rod, which turns about level: its weight at an angle is known in closed form."""
-    return begin(rod.rig(tmp_path), rod.logs(0), key=jax.random.key(0)).state.model
+    return begin(rod.rig(tmp_path_factory.mktemp("rod")), rod.logs(0), key=jax.random.key(0)).state.model
 
 
-def _forces(law: LoadFriction, model: StateSpaceModel, states: np.ndarray) -> np.ndarray:
-    """Forces of a law [N m] at angles, rates and torques."""
-
+@eqx.filter_jit
+def _along(law: LoadFriction, model: StateSpaceModel, states):
     def force(q, v, u):
         scene = model.scene(jnp.stack([q, v]), Inputs(u[None], u[None], a(0.0), a(0.0)))
         return law.force(scene, jnp.zeros(0))[0]
 
-    return np.asarray(jax.jit(jax.vmap(force))(*jnp.asarray(states.T)))
+    return jax.vmap(force)(*states.T)
 
 
-def _states(count: int = 400) -> np.ndarray:
+def _forces(law: LoadFriction, model: StateSpaceModel, states: np.ndarray) -> np.ndarray:
+    """Forces of a law [N m] at angles, rates and torques; one program for all laws of the same numbers."""
+    return np.asarray(_along(law, model, jnp.asarray(states)))
+
+
+def _states(count: int = 100) -> np.ndarray:
     """Angles, rates and torques."""
     return np.random.default_rng(0).normal(size=(count, 3)) * [2.0, 1.0, 3.0]
 
@@ -95,7 +100,7 @@ def test_a_rich_form_holds_the_plain_one(plain, rich, model):
 
 def test_forms_are_tried_in_one_order_from_plain_to_rich(around_rod, model):
     """Every richer form begins as the one before it, has a number more, and the last has none behind it."""
-    states, seen, ahead = _states(20), [], [c.start for c in LoadFriction.candidates(around_rod)]
+    states, seen, ahead = _states(), [], [c.start for c in LoadFriction.candidates(around_rod)]
     while ahead:
         law = ahead.pop()
         seen.append(law)

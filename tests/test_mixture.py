@@ -70,9 +70,9 @@ def _logs(signs, last: int) -> Dataset:
 
 def _grid(model: _Fall, seq: Dataset) -> tuple[np.ndarray, np.ndarray, float]:
     """Nodes, posterior over them in every row, and log p(y), by sums over a fine grid."""
-    x = np.linspace(-3.5, 3.5, 2001)
+    x = np.linspace(-3.5, 3.5, 1001)
     width, q, r = x[1] - x[0], np.exp(np.asarray(model.log_q))[0], np.exp(np.asarray(model.log_r))[0]
-    to = np.asarray(model.transition(jnp.asarray(x), None))
+    to = np.asarray(model.transition(x, None))
     kernel = np.exp(-0.5 * (x[:, None] - to[None]) ** 2 / q) / np.sqrt(2 * np.pi * q) * width
     y, u = np.asarray(seq.y)[:, 0], np.asarray(seq.u)[:, 0]
     seen = np.where(u[:, None] > 0, x[None], model.bend * x[None] ** 2)
@@ -193,22 +193,23 @@ def test_the_likelier_side_is_the_one_of_the_grid():
 
 def test_a_kept_path_is_followed_and_the_other_side_is_not_sought():
     """Right of the mixture's own path and left of it: about the former the same, about its mirror image the mirror."""
-    model, data, bank = _model(mean=0.0), _logs([1], ROWS), StartBank((1,), (0,))
+    model, data, bank = _model(mean=0.0), _logs([1, -1], ROWS), StartBank((1,), (0,))
     smoother = CubatureSmoother(bank)
     sought = e_step(model, data, smoother, key=KEY)
     mirrored = sought.state._replace(mean=-sought.state.mean)
     for side, kept in ((1, sought.state), (-1, mirrored)):
         about = e_step(model, data, smoother, key=KEY, kept=kept)
         np.testing.assert_allclose(
-            about.state.mean[0, ROWS // 2 :], side * sought.state.mean[0, ROWS // 2 :], atol=1e-3
+            about.state.mean[:, ROWS // 2 :], side * sought.state.mean[:, ROWS // 2 :], atol=1e-3
         )
         np.testing.assert_allclose(about.loglik, sought.loglik, atol=1e-3)
 
 
 def test_the_likelier_of_both_paths_is_taken():
     """Each by the model linearised about itself, one nat to either side; no number is less likely than any."""
-    model, data = _model(), _logs([1, -1, 1, -1], 0)
+    model, data = _model(), _logs([1, -1], 0)
     first = e_step(model, data, CubatureSmoother(StartBank((1,))), key=KEY)
+    first = jax.tree.map(lambda a: jnp.concatenate([a, a]), first)
     loglik = first.loglik + 30.0  # the first smoother's own are of models linearised about other paths
     second = first._replace(
         loglik=loglik + jnp.asarray([1.0, -1.0, jnp.nan, -1.0]), state=jax.tree.map(lambda a: a + 1, first.state)
@@ -221,15 +222,16 @@ def test_the_likelier_of_both_paths_is_taken():
 
 def test_two_sides_that_nothing_decides_are_both_reported():
     """With the square alone, and a start between them, the grid has half of its mass on each side."""
-    model, data = _model(mean=0.0), _logs([1], ROWS)
-    x, posterior, _ = _grid(model, jax.tree.map(lambda a: a[0], data))
-    right = posterior[-1] * (x > 0)
-    np.testing.assert_allclose(right.sum(), 0.5, atol=1e-6)
-    bank = StartBank((1,), (0,))
-    (other,) = branches(model, data, CubatureSmoother(bank), key=KEY)
-    assert other.sequence == 0 and other.angle == 0 and other.rows[1] == ROWS - 1
-    np.testing.assert_allclose(other.weight, 0.5, atol=0.1)
-    np.testing.assert_allclose(np.abs(other.mean[-1, 0]), right @ x / right.sum(), atol=0.05)
+    model, data = _model(mean=0.0), _logs([1, -1], ROWS)
+    others = branches(model, data, CubatureSmoother(StartBank((1,), (0,))), key=KEY)
+    assert [other.sequence for other in others] == [0, 1]
+    for i, other in enumerate(others):
+        x, posterior, _ = _grid(model, jax.tree.map(lambda a, i=i: a[i], data))
+        right = posterior[-1] * (x > 0)
+        np.testing.assert_allclose(right.sum(), 0.5, atol=1e-6)
+        assert other.angle == 0 and other.rows[1] == ROWS - 1
+        np.testing.assert_allclose(other.weight, 0.5, atol=0.1)
+        np.testing.assert_allclose(np.abs(other.mean[-1, 0]), right @ x / right.sum(), atol=0.05)
 
 
 def test_what_is_narrow_keeps_the_numbers_of_the_first_smoother():

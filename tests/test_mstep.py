@@ -157,7 +157,10 @@ def pendulum():
     return _case(model, data, *_expand(model, MASS, data))
 
 
-@pytest.mark.parametrize("name", ["slide", "pendulum"])
+slow = pytest.mark.slow  # fast: test_score_is_the_gradient_of_the_likelihood
+
+
+@pytest.mark.parametrize("name", ["slide", pytest.param("pendulum", marks=slow)])
 def test_score_is_the_gradient_of_the_likelihood(name, request):
     """Fisher's identity: exact for the Gaussian smoother at fixed linearisation."""
     case = request.getfixturevalue(name)
@@ -235,7 +238,8 @@ def test_noise_information_is_fishers_on_average(slides):
 
 def _weights(nodes, v):
     """What one speed gives to every node."""
-    return np.asarray(jax.vmap(lambda v: spread(nodes[None], v[None, None], jnp.ones((1, 1)))[0])(jnp.asarray(v)))
+    spread_one = lambda v: spread(nodes[None], v[None, None], jnp.ones((1, 1)))[0]  # noqa: E731
+    return np.asarray(jax.jit(jax.vmap(spread_one))(jnp.asarray(v)))
 
 
 def test_weights_of_the_nodes_are_a_partition_of_unity_that_interpolates():
@@ -284,11 +288,12 @@ def test_fit_reaches_the_optimum_of_the_penalised_likelihood():
         asymmetry = even @ jnp.linalg.solve(spread, even)
         return 0.5 * d @ information @ d + 0.5 * ridge + 0.5 * asymmetry
 
-    better = minimize(loss, w, jac=jax.grad(loss), method="BFGS", options={"maxiter": 2000})
+    slope = jax.jit(jax.grad(loss))
+    better = minimize(loss, w, jac=slope, method="BFGS", options={"maxiter": 2000})
     assert float(loss(w0)) - float(loss(w)) > 1e3
     # the loop ends when its smoothed gain is below 1e-3 nats a step; what is left must not matter (a nat = 1 std)
     assert float(loss(w)) - better.fun < 0.1
-    gradient = jax.grad(loss)(w)
+    gradient = slope(w)
     jac = weights.jacobian(model.unknown, w)
     hessian = jac.T @ (information + weights.symmetry(model.unknown, w0)) @ jac + np.diag(weights.precision(w))
     assert 0.5 * float(gradient @ jnp.linalg.solve(hessian, gradient)) < 0.01  # Newton decrement [nats]
@@ -388,7 +393,7 @@ def test_fit_with_a_bound_is_the_optimum_among_what_is_possible(least):
 
 
 def test_the_likelihood_along_a_path_is_that_of_the_smoother_which_linearises_there(slides):
-    model, data, _, _ = slides
+    model, data = slides[0], jax.tree.map(lambda a: a[:4], slides[1])
     bank = StartBank((1, 1))
     once, twice = (
         e_step(model, data, ExtendedKalmanSmoother(bank, iterations=count), key=jax.random.key(0)) for count in (1, 2)

@@ -41,28 +41,20 @@ WHOLE = {
     "units": {"theta1": "rad", "dtheta1": "rad/s"},
     "models": {"before": "before.npz", "after": "after.npz"},
     "friction_change": "Friction was bent.",
-    "tests": {
-        "before": [TEST, TEST | {"p_value": None}, TEST | {"slight": True}],
-        "after": [TEST | {"p_value": FAILS}],
-    },
-    "parameters": {
-        "before": {"m1": {"value": 1.0, "std": 0.1, "unit": "kg"}},
-        "after": {"m1": {"value": 1.1, "std": 0.1}},
-    },
+    "tests": {"before": [TEST, TEST | {"p_value": None}, TEST | {"slight": True}],
+        "after": [TEST | {"p_value": FAILS}]},
+    "parameters": {"before": {"m1": {"value": 1.0, "std": 0.1, "unit": "kg"}}, "after": {"m1": {"value": 1.1,
+        "std": 0.1}}},
     "noise": {"before": {"theta1": {"value": 0.005, "unit": "rad"}}, "after": {"theta1": 0.005}},
     "rounds": [
-        {
-            "horizon_s": 1.0,
-            "screened": [{"name": "cogging", "joint": 1, "channel": None, "inputs": [], "gain": 12.3}],
-            "refitted": [],
-            "accepted": "torsional spring at joint 2",
-        },
+        {"horizon_s": 1.0, "refitted": [], "accepted": "torsional spring at joint 2",
+         "screened": [{"name": "cogging", "joint": 1, "channel": None, "inputs": [], "gain": 12.3}]},
         {"horizon_s": 5.0, "screened": None, "refitted": None, "accepted": None},
     ],
     "next": ["Unhook the cable."],
     "seconds": 172.0,
     "versions": {"jax": "0.10.2"},
-}
+}  # fmt: skip
 
 
 class _Balance(HTMLParser):
@@ -95,6 +87,11 @@ def _parsed(html):
     return parser
 
 
+def _text(document, *pictures) -> str:
+    """What a reader of its page sees."""
+    return " ".join("".join(_parsed(page(document, *pictures)).text).split())
+
+
 FIGURES = (
     Picture("Errors", "A caption.", SVG),
     Picture("Learned", "", SVG, "found"),
@@ -103,10 +100,7 @@ FIGURES = (
 FIT = {
     "rig": "arm",
     "verdict": "Fitted the friction of 1 joint.",
-    "friction_law": [
-        {"joint": 1, "parameters": {}, "text": "theta1: Coulomb 0.03 N m."},
-        {"text": "theta2: rough."},
-    ],
+    "friction_law": [{"joint": 1, "parameters": {}, "text": "theta1: Coulomb 0.03 N m."}, {"text": "theta2: rough."}],
     "error": {"given_s": 1.0, "horizons_s": [1.0], "fit": {"theta1": [0.02]}},
     "units": {"theta1": "rad"},
     "parameters": {"m1": {"value": 1.0, "std": 0.1, "unit": "kg"}},
@@ -138,9 +132,8 @@ def test_pictures_of_one_title_are_chosen_from_and_every_picture_is_enlarged_wit
     sequences = [Picture("One test sequence", name, SVG, "error", name) for name in ("a.csv", "b.csv", "c.csv")]
     html = page(WHOLE, [*sequences, Picture("Errors", "", SVG, "error")])
     _parsed(html)
-    radios = re.findall(
-        r'<input type="radio" name="(\S+)" id="(\S+?)"( checked)?><label for="(\S+?)">(\S+)</label>', html
-    )
+    pattern = r'<input type="radio" name="(\S+)" id="(\S+?)"( checked)?><label for="(\S+?)">(\S+)</label>'
+    radios = re.findall(pattern, html)
     assert [label for *_, label in radios] == ["a.csv", "b.csv", "c.csv"]
     assert len({name for name, *_ in radios}) == 1 and all(own == of for _, own, _, of, _ in radios)
     assert [bool(checked) for _, _, checked, _, _ in radios] == [True, False, False]
@@ -148,12 +141,6 @@ def test_pictures_of_one_title_are_chosen_from_and_every_picture_is_enlarged_wit
     for place in range(1, MOST_PICTURES + 1):  # a picture that no rule shows would never be seen
         assert f".choose>input:nth-of-type({place}):checked~div:nth-of-type({place})" in html
     assert html.count("<figure") == 2
-
-
-def test_a_clean_rig_has_one_column_of_errors_and_no_effect():
-    text = " ".join(_parsed(page(REPORTS["without an effect"])).text)
-    assert "No effect of the catalogue" in text
-    assert "smaller by" not in text and "could not be told apart" not in text
 
 
 ORDER = {
@@ -177,20 +164,21 @@ ORDER = {
 @pytest.mark.parametrize("kind", ORDER)
 def test_a_page_says_what_was_found_in_order(kind):
     document, words = ORDER[kind]
-    parts = words.split(" | ")
-    text = " ".join("".join(_parsed(page(document, FIGURES)).text).split())
-    places = [text.find(part) for part in parts]
-    assert min(places) >= 0, [part for part, place in zip(parts, places, strict=True) if place < 0]
-    assert places == sorted(places)
+    text = _text(document, FIGURES)
+    places = {part: text.find(part) for part in words.split(" | ")}
+    assert min(places.values()) >= 0, places
+    assert list(places.values()) == sorted(places.values())
     for absent in ("What was found", "could not be told apart", "smaller by") if kind == "fit" else ("was learned",):
         assert absent not in text
+    clean = _text(REPORTS["without an effect"])  # one column of errors and no effect
+    assert (
+        "No effect of the catalogue" in clean and "smaller by" not in clean and "could not be told apart" not in clean
+    )
 
 
 def test_tiles_show_what_changed_most_and_what_grows_is_no_success():
     """Three joints, of which the third falls most and the second grows."""
-    before, after = (
-        {name: [x] for name, x in zip("abc", sizes, strict=True)} for sizes in ((1, 1, 1), (0.9, 1.4, 0.2))
-    )
+    before, after = ({n: [x] for n, x in zip("abc", each, strict=True)} for each in ((1, 1, 1), (0.9, 1.4, 0.2)))
     error = {"given_s": 1.0, "horizons_s": [1.0], "before": before, "after": after}
     html = page(WHOLE | {"error": error})
     tiles = re.findall("error of ([abc]), 1 s ahead", html)
@@ -200,14 +188,14 @@ def test_tiles_show_what_changed_most_and_what_grows_is_no_success():
 
 def test_evidence_by_many_steps_is_a_share_beside_chance():
     evidence = {"share_of_error": 0.42, "chance": 0.031, "parts": [4, 5], "p_value": None, "log_likelihood_gain": None}
-    text = " ".join("".join(_parsed(page(WHOLE | {"effects": [EFFECT | {"evidence": evidence}]})).text).split())
+    text = _text(WHOLE | {"effects": [EFFECT | {"evidence": evidence}]})
     assert "it removes 42 % of the error, on 4 of 5 parts of them. Columns shifted in time remove up to 3.1 %." in text
     assert "by luck" not in text and "log-likelihood of" not in text
 
 
 def test_of_many_tests_all_that_fail_are_listed_and_of_the_others_a_part():
     bad, good = TEST | {"meaning": "It fails."}, TEST | {"p_value": 0.9, "meaning": "It holds."}
-    text = "".join(_parsed(page(WHOLE | {"tests": {"before": 50 * [good, bad], "after": 60 * [good]}})).text)
+    text = _text(WHOLE | {"tests": {"before": 50 * [good, bad], "after": 60 * [good]}})
     assert (text.count("It fails."), text.count("It holds.")) == (50, 40)
     assert "50 more pass" in text and "20 more pass" in text
 
@@ -227,31 +215,23 @@ def test_all_text_is_escaped():
     assert evil in "".join(_parsed(html).text)
 
 
-@pytest.mark.parametrize(
-    ("key", "text"),
-    [
-        (("torsional_spring", 1, None, ()), "torsional spring at joint 1"),
-        (("unknown_function", 2, None, ("theta1", "u")), "unknown function of theta1 and u at joint 2"),
-        (("sensor_delay", None, "all", ()), "sensor delay on all sensors"),
-        (("sensor_bias", None, "x", ()), "sensor bias on x"),
-    ],
-)
-def test_a_report_calls_an_effect_as_the_search_does(key, text):
-    assert words(key) == text
-    assert label(dict(zip(("name", "joint", "channel", "inputs"), key, strict=True))) == text
+KEYS = {
+    "torsional spring at joint 1": ("torsional_spring", 1, None, ()),
+    "unknown function of theta1 and u at joint 2": ("unknown_function", 2, None, ("theta1", "u")),
+    "sensor delay on all sensors": ("sensor_delay", None, "all", ()),
+    "sensor bias on x": ("sensor_bias", None, "x", ()),
+}
+
+
+def test_a_report_calls_an_effect_as_the_search_does():
+    for text, key in KEYS.items():
+        assert words(key) == label(dict(zip(("name", "joint", "channel", "inputs"), key, strict=True))) == text
     assert label({}) == "unnamed"
 
 
 def test_numbers_as_a_reader_writes_them():
-    assert [number(v) for v in (0.00585, 1234.5, -2.0, 0, None, float("nan"))] == [
-        "0.00585",
-        "1234",
-        "−2.00",
-        "0",
-        "–",
-        "–",
-    ]
-    assert number(1.5e-9) == "1.50 × 10⁻⁹"
+    texts = ["0.00585", "1234", "−2.00", "0", "–", "–", "1.50 × 10⁻⁹"]
+    assert [number(v) for v in (0.00585, 1234.5, -2.0, 0, None, float("nan"), 1.5e-9)] == texts
     assert with_std(0.059951, 0.00037) == "0.05995 ± 0.00037"
     assert with_std(12.3456, 3.21) == "12.3 ± 3.2"
     assert with_std(1.5e-6, 2e-7) == "(1.50 ± 0.20) × 10⁻⁶"
@@ -267,7 +247,7 @@ def test_short_test_sequences_have_no_errors_beyond_their_end():
     assert reached(error | {"reach_s": 1.0}) == [0.25, 1.0]
     assert reached(error | {"reach_s": 9.0}) == [0.25, 1.0, 2.0]
     assert reached(error | {"reach_s": -0.1}) == reached({}) == []
-    text = " ".join("".join(_parsed(page(WHOLE | {"error": error}, FIGURES)).text).split())
+    text = _text(WHOLE | {"error": error}, FIGURES)
     assert "error of theta1, 0.5 s ahead" in text
     assert "2.0 s" not in text
 

@@ -17,6 +17,9 @@ import pytest
 from helpers import nnap
 from shell import ENVIRONMENT
 
+from nnap_em import launch
+from nnap_em.commands import identify as identify_command
+from nnap_em.em.loop import FitError
 from nnap_em.launch import free_address
 from nnap_em.numerics.parallel import all_devices, each, over
 
@@ -26,14 +29,15 @@ def _weigh(common, one):
     return common["a"] @ scale, jax.random.normal(key, (3,)), nothing
 
 
-@pytest.mark.parametrize("together", [None, 1, 3, 100])
-def test_groups_change_nothing(together):
+def test_groups_change_nothing():
     common, scales = {"a": jnp.arange(6.0).reshape(2, 3)}, jnp.arange(21.0).reshape(7, 3)
     keys = jax.random.split(jax.random.key(0), 7)
-    product, draw, nothing = each(_weigh, common, (scales, keys, jnp.zeros((7, 4, 0))), together=together)
-    assert nothing.shape == (7, 4, 0)
-    np.testing.assert_allclose(product, scales @ common["a"].T, rtol=1e-15)
-    np.testing.assert_array_equal(draw, jax.vmap(lambda k: jax.random.normal(k, (3,)))(keys))
+    expected = jax.jit(jax.vmap(lambda k: jax.random.normal(k, (3,))))(keys)
+    for together in (None, 1, 3, 100):
+        product, draw, nothing = each(_weigh, common, (scales, keys, jnp.zeros((7, 4, 0))), together=together)
+        assert nothing.shape == (7, 4, 0)
+        np.testing.assert_allclose(product, np.asarray(scales) @ np.asarray(common["a"]).T, rtol=1e-15)
+        np.testing.assert_array_equal(draw, expected)
 
 
 def test_mesh_of_other_axes_is_refused():
@@ -115,7 +119,7 @@ def rig(tmp_path_factory) -> Path:
 @contextlib.contextmanager
 def _launched(*order: object, **options) -> Iterator[subprocess.Popen]:
     """Processes of a command, which end at the end."""
-    options |= {"env": ENVIRONMENT, "stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE, "text": True}
+    options = {"env": ENVIRONMENT} | options | {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE, "text": True}
     run = subprocess.Popen([sys.executable, "-m", "nnap_em.launch", *map(str, order)], **options)
     try:
         yield run
@@ -134,47 +138,59 @@ def _numbers(out: Path) -> dict[str, np.ndarray]:
         return {name: stored[name] for name in stored.files if stored[name].dtype.kind == "f"}
 
 
-@pytest.fixture(scope="module")
-def alone(rig) -> dict[str, np.ndarray]:
-    """Numbers of the fit by one process."""
-    out = rig.parent / "alone"
-    assert nnap("identify", rig, "--epochs", 1, "--out", out, "--quiet") == 0
-    return _numbers(out)
-
-
-def _agree(out: Path, alone: dict[str, np.ndarray]) -> None:
-    numbers = _numbers(out)
-    assert len(numbers) > 5 and numbers.keys() == alone.keys()
-    for name, value in numbers.items():
-        # as over devices; the Hessian in the file is a sum over all rows, and as much larger
-        np.testing.assert_allclose(value, alone[name], rtol=1e-8, atol=1e-8, err_msg=name)
-
-
 @pytest.mark.slow  # fast: test_groups_change_nothing
-def test_processes_agree(rig, alone, tmp_path):
-    with _launched(2, "identify", rig, "--epochs", 1, "--out", tmp_path / "out") as run:
-        _, said = run.communicate(timeout=300)
-    assert run.returncode == 0, said
-    _agree(tmp_path / "out", alone)
-
-
-def test_several_machines_need_to_know_their_share():
-    order = [sys.executable, "-m", "nnap_em.launch", "--coordinator", "localhost:1", "2", "identify", ".", "--out", "x"]
-    done = subprocess.run(order, env=ENVIRONMENT, capture_output=True, text=True)
-    assert done.returncode == 2
-    assert "--coordinator needs --here N: processes on this machine" in done.stderr
-
-
-@pytest.mark.slow  # fast: test_groups_change_nothing
-def test_two_launchers_are_two_machines(rig, alone, tmp_path):
+def test_two_launchers_are_two_machines_whose_processes_agree_with_one(rig, tmp_path):
+    assert nnap("identify", rig, "--epochs", 1, "--out", tmp_path / "alone", "--quiet") == 0
     place = ["--coordinator", free_address(), "--here", "1", "--first"]
     order = [2, "identify", rig, "--epochs", 1, "--out"]
     with _launched(*place, 0, *order, tmp_path / "0") as one, _launched(*place, 1, *order, tmp_path / "1") as other:
         runs = one, other
         said = [run.communicate(timeout=300)[1] for run in runs]
     assert [run.returncode for run in runs] == [0, 0], said
-    _agree(tmp_path / "0", alone)
+    numbers, alone = _numbers(tmp_path / "0"), _numbers(tmp_path / "alone")
+    assert len(numbers) > 5 and numbers.keys() == alone.keys()
+    for name, value in numbers.items():
+        # as over devices; the Hessian in the file is a sum over all rows, and as much larger
+        np.testing.assert_allclose(value, alone[name], rtol=1e-8, atol=1e-8, err_msg=name)
     assert not (tmp_path / "1").exists()
+
+
+WRONG = {
+    "--coordinator localhost:1 2 identify . --out x": "--coordinator needs --here N: processes on this machine",
+    "--coordinator localhost:1 --here 2 --first 1 2 identify . --out x": "processes 1 to 2 of 2: check --first, --here",
+    "2 identify .": "the command needs --out FOLDER",
+}
+
+
+@pytest.mark.parametrize("line", WRONG)
+def test_several_machines_need_to_know_their_share(line, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["launch", *line.split()])
+    with pytest.raises(SystemExit, match="2"):
+        launch.main()
+    assert WRONG[line] in capsys.readouterr().err
+
+
+TOY = """
+import sys, time
+if "--work" in sys.argv:  # not in the process that starts the others
+    import numpy as np
+    from nnap_em.commands import identify as command
+    from nnap_em.storage.journal import HERE, step
+    @step(lambda *_: HERE)
+    def toy(i):
+        time.sleep(0.05)
+        return np.full(3, float(i))
+    command.identify = lambda *_, **__: [toy(i) for i in range(10_000)]
+"""
+"""A command of steps that take no time to compile, in processes that look for this module when they begin."""
+
+
+@pytest.fixture
+def toy(tmp_path) -> dict:
+    """The environment of its processes."""
+    (tmp_path / "site").mkdir()
+    (tmp_path / "site/sitecustomize.py").write_text(TOY)
+    return {"env": ENVIRONMENT | {"PYTHONPATH": os.pathsep.join([str(tmp_path / "site"), ENVIRONMENT["PYTHONPATH"]])}}
 
 
 def _after_the_first_step(run: subprocess.Popen, out: Path) -> None:
@@ -185,9 +201,9 @@ def _after_the_first_step(run: subprocess.Popen, out: Path) -> None:
 
 
 @pytest.mark.slow  # fast: test_groups_change_nothing
-def test_ctrl_c_says_how_to_go_on(rig, tmp_path):
+def test_ctrl_c_says_how_to_go_on(rig, toy, tmp_path):
     out = tmp_path / "out"
-    with _launched(2, "identify", rig, "--epochs", 500, "--out", out, start_new_session=True) as run:
+    with _launched(2, "identify", rig, "--out", out, start_new_session=True, **toy) as run:
         _after_the_first_step(run, out)
         os.killpg(run.pid, signal.SIGINT)  # as a terminal does
         _, said = run.communicate(timeout=60)
@@ -196,14 +212,20 @@ def test_ctrl_c_says_how_to_go_on(rig, tmp_path):
 
 
 @pytest.mark.slow  # fast: test_groups_change_nothing
-def test_a_dying_process_ends_the_run_and_leaves_the_finished_steps(rig, tmp_path, capsys):
+def test_a_dying_process_ends_the_run_and_leaves_the_finished_steps(rig, toy, tmp_path, monkeypatch, capsys):
     out = tmp_path / "out"
-    with _launched(2, "identify", rig, "--epochs", 500, "--out", out) as run:
+    with _launched(2, "identify", rig, "--out", out, **toy) as run:
         _after_the_first_step(run, out)
         children = Path(f"/proc/{run.pid}/task/{run.pid}/children").read_text().split()
         os.kill(int(children[1]), signal.SIGKILL)
         _, said = run.communicate(timeout=60)
     assert run.returncode == 1
     assert "process 1 was killed by SIGKILL" in said and "--resume" in said
-    assert nnap("identify", rig, "--resume", "--epochs", 3, "--out", out) == 0
-    assert "resumed with" in capsys.readouterr().err
+
+    def stop(*_, **__):
+        raise FitError("the fit goes on here")
+
+    monkeypatch.setattr(identify_command, "identify", stop)
+    assert nnap("identify", rig, "--resume", "--out", out) == 2
+    said = capsys.readouterr().err
+    assert "resumed with" in said and "the fit goes on here" in said

@@ -190,11 +190,15 @@ def test_two_effects_together_move_as_the_recording():
     np.testing.assert_allclose(_motion(u, (force, drive)), x, rtol=0, atol=0.01 * np.abs(_motion(u) - x).max())
 
 
+@pytest.fixture(scope="module")
+def log():
+    return _log(_motion(_torques()), _torques())
+
+
 @pytest.mark.parametrize("tag", LAWS)
-def test_strength_zero_changes_no_bit(tag):
+def test_strength_zero_changes_no_bit(tag, log):
     law = LAWS[tag]
     plant = Plant(tag, None, "theta2") if law.reading or law.delay else Plant(tag, 2, None)
-    log = _log(_motion(_torques()), _torques())
     values = law.draw(np.random.default_rng(0), planted_make.Ranges(-1.0, 1.0)) | law.amount(0.0)
     same = planted_make.planted(log, [(plant, values)], BODY | FRICTION, DT)
     assert same.keys() == log.keys()
@@ -236,7 +240,18 @@ def test_nobody_s_folder_is_overwritten(shared, tmp_path):
     assert (tmp_path / "thesis.txt").exists()
 
 
-@pytest.mark.parametrize("name", CASES)
+OF_LAWS = {plant.tag: name for name in PLANTED for plant in case_of(name).plants}
+"""A case of each law."""
+OTHERS = [name for name in CASES if name not in {*OF_LAWS.values(), CONTROLS[0]}]
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        *sorted({*OF_LAWS.values(), CONTROLS[0]}),
+        *(pytest.param(name, marks=pytest.mark.slow) for name in OTHERS),  # fast: test_every_case_is_made of OF_LAWS
+    ],
+)
 def test_every_case_is_made(name, shared, tmp_path):
     truth = planted_make.make(name, tmp_path, shared / "data" / "measured")
     assert tomllib.loads((tmp_path / "truth.toml").read_text()) == truth
@@ -257,8 +272,8 @@ def test_wrong_numbers_are_off_by_so_many_standard_deviations():
     assert planted_make.wrong(text, "rig-recorded", 0.0) == text
 
 
-@pytest.mark.parametrize("name", [PLANTED[0], PLANTED[-1]])
-def test_a_planted_rig_is_read_under_its_name(name, shared, tmp_path):
+def test_a_planted_rig_is_read_under_its_name(shared, tmp_path):
+    name = PLANTED[-1]
     planted_make.make(name, tmp_path, shared / "data" / "measured")
     rig = read_rig(tmp_path / "rig.toml", specs)
     assert rig.name == name

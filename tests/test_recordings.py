@@ -4,6 +4,7 @@ import struct
 import sys
 from types import SimpleNamespace
 
+import h5py
 import numpy as np
 import pytest
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
@@ -29,6 +30,7 @@ from nnap_em.data.formats import write_csv
 from nnap_em.import_ import codecs
 from nnap_em.import_.files import reader
 from nnap_em.import_.objects import flatten, pick
+from nnap_em.import_.ros2 import Layout
 
 T = 0.01 * np.arange(300)
 Q = np.stack([np.sin(T), np.cos(2 * T)], axis=1)
@@ -64,9 +66,8 @@ LAYOUTS = {
 def test_every_layout_of_a_file_gives_what_was_written(tmp_path, options):
     path = _log(tmp_path / "a.mcap", **options)
     topics = {topic.name: topic for topic in reader(path).topics(path)}
-    assert topics["/js"].fields[2:] == (
-        "position[shoulder]", "position[elbow]", "velocity[shoulder]", "velocity[elbow]"
-    )  # fmt: skip
+    joints = [f"{word}[{joint}]" for word in ("position", "velocity") for joint in ("shoulder", "elbow")]
+    assert topics["/js"].fields[2:] == tuple(joints)
     assert topics["/cmd"].fields == ("layout.data_offset", "data[0]")
     assert topics["/js"].messages in (300, None)
     tracks = _read(path, js=("position[elbow]", "velocity[shoulder]"), cmd=("data[0]",))
@@ -80,13 +81,8 @@ def test_every_layout_of_a_file_gives_what_was_written(tmp_path, options):
 
 def test_messages_of_many_forms_on_one_topic_are_those_of_the_generic_decoder(tmp_path, monkeypatch):
     """Frames of other lengths, joints in another order, a joint that is missing, and a list that is empty."""
-    forms = [
-        ("base", ("a", "b")),
-        ("a longer frame", ("a", "b")),
-        ("base", ("b", "a")),
-        ("", ("a",)),
-        ("x", ("c", "a")),
-    ]
+    two = ("a", "b")  # names of joints in messages of a frame
+    forms = [("base", two), ("a longer frame", two), ("base", ("b", "a")), ("", ("a",)), ("x", ("c", "a"))]
     rng = np.random.default_rng(0)
     messages = []
     for k in rng.integers(len(forms), size=200):
@@ -104,22 +100,18 @@ def test_messages_of_many_forms_on_one_topic_are_those_of_the_generic_decoder(tm
     assert np.isnan(fast["velocity[b]"]).any() and np.isfinite(fast["position[a]"]).all()
 
 
-def test_the_fast_way_is_taken(tmp_path, monkeypatch):
-    path = _log(tmp_path / "a.mcap")
-    calls = []
-    generic = codecs.Decoded.read
-    monkeypatch.setattr(codecs.Decoded, "read", lambda self, data, start, size, paths: calls.append(start.size) or
-                        generic(self, data, start, size, paths))  # fmt: skip
+def test_the_fast_way_is_taken_unless_it_differs_from_the_generic_decoder(tmp_path, monkeypatch):
+    path, calls, generic = _log(tmp_path / "a.mcap"), [], codecs.Decoded.read
+
+    def read(self, data, start, size, paths):
+        calls.append(start.size)
+        return generic(self, data, start, size, paths)
+
+    monkeypatch.setattr(codecs.Decoded, "read", read)
     _read(path, js=("position[elbow]",), cmd=("data[0]",))
     assert calls == [1, 1]  # one look at each topic
-
-
-def test_a_layout_that_differs_from_the_generic_decoder_is_not_used(tmp_path, monkeypatch):
-    from nnap_em.import_.ros2 import Layout
-
     monkeypatch.setattr(Layout, "read", lambda self, data, start, path: np.zeros(start.size))
-    values = _read(_log(tmp_path / "a.mcap"), js=("position[elbow]",))["/js"].values
-    np.testing.assert_array_equal(values["position[elbow]"], Q[:, 1])
+    np.testing.assert_array_equal(_read(path, js=("position[elbow]",))["/js"].values["position[elbow]"], Q[:, 1])
 
 
 MESSAGE = {  # a definition, a message of it, and numbers in it
@@ -186,8 +178,6 @@ AXES = {  # how a group says its times, and the unit
 
 @pytest.mark.parametrize("name, made, attributes", AXES.values(), ids=AXES)
 def test_hdf5_finds_its_time_axis(tmp_path, name, made, attributes):
-    import h5py
-
     path = write_hdf5(tmp_path / "a.h5", {"arm/state": {name: made(T), "q": Q, "u": U, "gains": np.ones(7)}})
     with h5py.File(path, "a") as file:
         file[f"arm/state/{name}"].attrs.update(attributes)
@@ -278,41 +268,30 @@ def _unread(path, encoding="flatbuffer", form="bfbs"):
     return write_mcap(path, {"/js": (schema, ns(T), [b"1234"] * 300)})
 
 
-BAD = {  # the file, and words of the message
-    "no MCAP file": ("a.mcap", lambda p: p.write_text("hello, world"), ["no MCAP file"]),
-    "a changed bit": ("a.mcap", _flipped, ["the checksum of a chunk does not hold", "another copy"]),
-    "unknown compression": ("a.mcap", _lost, ["'snap'", "lz4, zstd or none"]),
-    "unknown encoding": ("a.mcap", _unread, ["'/js'", "'flatbuffer' is not read", "JSON or protobuf"]),
-    "IDL": ("a.mcap", lambda p: _unread(p, "cdr", "ros2idl"), ["'/js'", "'ros2idl'", "write it as"]),
-    "no stamps": ("a.mcap", lambda p: _stamped(p, None, 0 * ns(T)), ["'/js'", "no stamps", "300 messages", "record"]),
-    "backwards": (
-        "a.mcap",
-        lambda p: _numbered(p, ns(T) - 5 * NS * (np.arange(300) > 200), 0 * ns(T)),
-        ["'/js'", "backwards at message 202, by 4.99 s", "cut the file"],
-    ),
-    "no JSON": (
-        "a.mcap",
-        lambda p: write_mcap(p, {"/js": ((*plain_json()[:4], lambda m: m), ns(T), [b'{"q": 1'] * 300)}),
-        ["'/js'", "does not fit its schema (Expecting", "record again"],
-    ),
-    "HDF5 without times": (
-        "a.h5",
-        lambda p: write_hdf5(p, {"js": {"time": np.where(T[5] == T, np.nan, T), "q": T}}),
-        ["'/js/time'", "no numbers", "cut the rows"],
-    ),
-    "no messages": ("a.mcap", lambda p: write_mcap(p, {"/js": (plain_json(), [], [])}), ["'/js'", "no messages"]),
-    "no HDF5 file": ("a.h5", lambda p: p.write_text("hello"), ["no HDF5 file", "another copy"]),
-    "no time axis": ("a.h5", lambda p: write_hdf5(p, {"js": {"q": T}}), ["'/js'", "no time axis (holds q)", "`time`"]),
-    "HDF5 backwards": (
-        "a.h5",
-        lambda p: write_hdf5(p, {"js": {"time": T[::-1], "q": T}}),
-        ["'/js/time'", "backwards at row 2"],
-    ),
-    "CSV with another time": ("a.csv", lambda p: write_csv(p, {"tim": T, "q": T}), ["times (found tim, q)", "'time'"]),
-    "no such file": ("b.mcap", lambda p: None, ["no such file"]),
-    "a folder": ("a.mcap", lambda p: p.mkdir(), ["is a folder", "give the log in it"]),
-    "another kind": ("a.dat", lambda p: p.write_text("x"), ["logs end in .mcap, .h5", "rename"]),
-}
+BAD = {  # the file, what writes it, and words of the message
+    "no MCAP file": ("a.mcap", lambda p: p.write_text("hello, world"), "no MCAP file"),
+    "a changed bit": ("a.mcap", _flipped, "the checksum of a chunk does not hold | another copy"),
+    "unknown compression": ("a.mcap", _lost, "'snap' | lz4, zstd or none"),
+    "unknown encoding": ("a.mcap", _unread, "'/js' | 'flatbuffer' is not read | JSON or protobuf"),
+    "IDL": ("a.mcap", lambda p: _unread(p, "cdr", "ros2idl"), "'/js' | 'ros2idl' | write it as"),
+    "no stamps": ("a.mcap", lambda p: _stamped(p, None, 0 * ns(T)), "'/js' | no stamps | 300 messages | record"),
+    "backwards": ("a.mcap", lambda p: _numbered(p, ns(T) - 5 * NS * (np.arange(300) > 200), 0 * ns(T)),
+        "'/js' | backwards at message 202, by 4.99 s | cut the file"),
+    "no JSON": ("a.mcap", lambda p: write_mcap(p, {"/js": ((*plain_json()[:4], lambda m: m), ns(T),
+        [b'{"q": 1'] * 300)}),
+        "'/js' | does not fit its schema (Expecting | record again"),
+    "HDF5 without times": ("a.h5", lambda p: write_hdf5(p, {"js": {"time": np.where(T[5] == T, np.nan, T), "q": T}}),
+        "'/js/time' | no numbers | cut the rows"),
+    "no messages": ("a.mcap", lambda p: write_mcap(p, {"/js": (plain_json(), [], [])}), "'/js' | no messages"),
+    "no HDF5 file": ("a.h5", lambda p: p.write_text("hello"), "no HDF5 file | another copy"),
+    "no time axis": ("a.h5", lambda p: write_hdf5(p, {"js": {"q": T}}), "'/js' | no time axis (holds q) | `time`"),
+    "HDF5 backwards": ("a.h5", lambda p: write_hdf5(p, {"js": {"time": T[::-1], "q": T}}),
+        "'/js/time' | backwards at row 2"),
+    "CSV with another time": ("a.csv", lambda p: write_csv(p, {"tim": T, "q": T}), "times (found tim, q) | 'time'"),
+    "no such file": ("b.mcap", lambda p: None, "no such file"),
+    "a folder": ("a.mcap", lambda p: p.mkdir(), "is a folder | give the log in it"),
+    "another kind": ("a.dat", lambda p: p.write_text("x"), "logs end in .mcap, .h5 | rename"),
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("name, make, words", BAD.values(), ids=BAD)
@@ -323,24 +302,28 @@ def test_what_cannot_be_read_is_refused_with_its_mend(tmp_path, name, make, word
         source = reader(path)
         source.topics(path)
         source.read(path, {"" if name.endswith("csv") else "/js": ("q",)})
-    for word in (str(path), *words):
+    for word in (str(path), *words.split(" | ")):
         assert word in str(refused.value)
     assert ";" in str(refused.value)
 
 
-@pytest.mark.parametrize("name, module", [("a.mcap", "mcap"), ("a.h5", "h5py")])
-def test_without_the_extra_the_message_names_it(tmp_path, monkeypatch, name, module):
-    for each in [m for m in sys.modules if m == module or m.startswith(f"{module}.")]:
-        monkeypatch.setitem(sys.modules, each, None)
-    monkeypatch.setitem(sys.modules, module, None)
-    (tmp_path / name).write_bytes(b"any")
-    with pytest.raises(DataError, match=r'cannot be read without .*; pip install "nnap-em\[logs\]"'):
+EXTRAS = {  # the library that is not there: the file of its kind, and the start of the message
+    "mcap": ("a.mcap", lambda p: p.write_bytes(b"any"), "cannot be read without .*; "),
+    "h5py": ("a.h5", lambda p: p.write_bytes(b"any"), "cannot be read without .*; "),
+    "zstandard": ("a.mcap", lambda p: _log(p, **LAYOUTS["zstd"]), "packed by zstd, .*"),
+    "lz4": ("a.mcap", lambda p: _log(p, **LAYOUTS["lz4"]), "packed by lz4, .*"),
+}
+
+
+@pytest.mark.parametrize("module", EXTRAS)
+def test_without_the_extra_the_message_names_it(tmp_path, monkeypatch, module):
+    name, write, words = EXTRAS[module]
+    write(tmp_path / name)
+    if words.startswith("packed"):
+        monkeypatch.setattr(f"mcap.stream_reader.{module}", None)
+    else:
+        for each in [m for m in sys.modules if m.startswith(f"{module}.")] + [module]:
+            monkeypatch.setitem(sys.modules, each, None)
+    with pytest.raises(DataError, match=words + r'pip install "nnap-em\[logs\]"'):
         reader(tmp_path / name).topics(tmp_path / name)
-
-
-@pytest.mark.parametrize("packing, module", [("zstd", "zstandard"), ("lz4", "lz4")])
-def test_without_the_library_of_the_chunks_the_message_names_it(tmp_path, monkeypatch, packing, module):
-    path = _log(tmp_path / "a.mcap", **LAYOUTS[packing])
-    monkeypatch.setattr(f"mcap.stream_reader.{module}", None)
-    with pytest.raises(DataError, match=rf'packed by {packing}, .*pip install "nnap-em\[logs\]"'):
-        _read(path, js=("position[elbow]",))
+        _read(tmp_path / name, js=("position[elbow]",))

@@ -151,14 +151,14 @@ def test_lost_sequences_take_no_part():
     assert run_tests(whole._replace(used=np.zeros(10, bool)), NAMES) == []
 
 
-def _slide(force, noise=(1e-3, 1e-4), mass=2.0, seconds=3.0, sequences=6):
+def _slide(force, noise=(1e-3, 1e-4), mass=2.0):
     """A slide with both states measured under a force that depends on time, position and velocity; a fit of it."""
     read = {"x": noise[0], "dx": noise[1]}
     rig = Rig("slide", "slide", {"m": Declared(mass, 0.0)}, False, ("u",), (1,), DT, "sequence", tuple(read), read, {})
     rng = np.random.default_rng(0)
-    rows = round(seconds / DT) + 1
+    rows = round(3.0 / DT) + 1
     logs, truth = [], []
-    for _ in range(sequences):
+    for _ in range(6):
         t = DT * np.arange(rows)
         u = np.sin(rng.uniform(1, 4) * t + rng.uniform(0, 6))
         x, v = rng.normal(), rng.normal()
@@ -205,6 +205,7 @@ def test_a_known_force_comes_back_within_its_standard_deviation(forced):
     np.testing.assert_allclose(left.u, data.u)
 
 
+@pytest.mark.slow  # fast: test_the_smoother_of_the_fit_is_the_one_that_smooths
 def test_a_force_comes_back_by_particles_too(forced):
     """Whatever smooths gives all that a residual needs."""
     fitted, data, _ = forced
@@ -229,8 +230,8 @@ def test_adding_an_effect_back_gives_its_force():
     np.testing.assert_allclose(whole.force[:, :-1, 0], truth[:, :-1], atol=0.2 * np.std(truth))
 
 
-def test_there_is_an_innovation_where_there_is_a_reading():
-    fitted, data, _ = _slide(lambda t, x, v: 0.0, seconds=0.5, sequences=2)
+def test_there_is_an_innovation_where_there_is_a_reading(forced):
+    fitted, data, _ = forced
     y = np.where(_noise(15, data.y.shape) > 1, np.nan, data.y)
     left = residual(fitted, data._replace(y=y))
     assert np.isnan(y).any()
@@ -245,7 +246,6 @@ def test_joints_are_called_by_number_and_by_the_name_of_their_own():
     assert with_names(text, names.coordinates) == expected
 
 
-def test_names_carry_units():
-    fitted, _, _ = _slide(lambda t, x, v: 0.0, seconds=0.5, sequences=2)
-    names = names_of(fitted)
+def test_names_carry_units(forced):
+    names = names_of(forced[0])
     assert [names.unit(n) for n in ("x", "dx", "u", "time")] == ["m", "m/s", "N", "s"]

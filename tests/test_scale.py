@@ -1,6 +1,7 @@
 """What a machine that nothing drives cannot tell: the scale of its masses and friction."""
 
 import dataclasses
+import math
 
 import jax
 import jax.numpy as jnp
@@ -23,6 +24,7 @@ ARM = {n: Declared(v, 0.1 * v if n[0] in "mI" else 0.0) for n, v in plant.SYSTEM
 def _swinging(rig: Rig, scale: float = 1.0, torque: float = 0.0) -> Dataset:
     """A pendulum of the declared body with viscous friction, all masses `scale` times as large."""
     system = build_system(rig)
+    m, lc, inertia, g = (float(getattr(system, name)) for name in ("m", "lc", "I", "g"))
     rng, rows = np.random.default_rng(0), 150
     x, u = np.empty((4, rows, 2)), torque * np.sin(3 * rig.dt * np.arange(rows) + np.arange(4)[:, None])
     for s in range(4):
@@ -30,8 +32,8 @@ def _swinging(rig: Rig, scale: float = 1.0, torque: float = 0.0) -> Dataset:
         q, v = x[s, 0]
         for k in range(1, rows):
             for _ in range(20):
-                force = u[s, k - 1] / scale - 0.02 * v - float(system.m * system.lc * system.g) * np.sin(q)
-                v += rig.dt / 20 * force / float(system.m * system.lc**2 + system.I)
+                force = u[s, k - 1] / scale - 0.02 * v - m * lc * g * math.sin(q)
+                v += rig.dt / 20 * force / (m * lc**2 + inertia)
                 q += rig.dt / 20 * v
             x[s, k] = q, v
     y = x[..., :1] + 0.002 * rng.normal(size=x[..., :1].shape)

@@ -56,29 +56,20 @@ def _candidate(name: str, spread: float = 2.0) -> Candidate:
     return Candidate(_law(name), (_law(name, 1.0),), _law(name, spread))
 
 
-def _found(removed: float) -> Evidence:
-    return Evidence(removed=removed)
-
-
-def _function(name: str = "unknown_function"):
-    axis = Axis(("x",), -2.0, 2.0, False, 20)
-    return catalogue[name](axis.centres(), (axis,), joint=1)
-
-
-def _of_input():
-    axis = InputAxis(("u",), -2.0, 2.0, False, 20, index=0)
+def _function(axis=None):
+    axis = axis or Axis(("x",), -2.0, 2.0, False, 20)
     return catalogue["unknown_function"](axis.centres(), (axis,), joint=1)
 
 
-def _spring():
-    return catalogue["torsional_spring"](*map(jnp.asarray, (20.0, 1.0, 0.0, 0.0)), joint=1)
+OF_INPUT = _function(InputAxis(("u",), -2.0, 2.0, False, 20, index=0))
+SPRING = catalogue["torsional_spring"](*map(jnp.asarray, (20.0, 1.0, 0.0, 0.0)), joint=1)
 
 
 def _with(*names: str) -> Hypothesis:
     """The slide with these effects."""
     hypothesis = BARE
     for i, name in enumerate(names):
-        hypothesis = hypothesis.plus(_law(name, 1.0 + i), _candidate(name, 2.0 + i), _found(0.5 + 0.1 * i))
+        hypothesis = hypothesis.plus(_law(name, 1.0 + i), _candidate(name, 2.0 + i), Evidence(removed=0.5 + 0.1 * i))
     return hypothesis
 
 
@@ -99,15 +90,10 @@ def test_certainty_is_the_marginal_of_the_posterior():
         assert certainty(_candidate(name), hypothesis.model.effects[place], cov) == pytest.approx(expected, rel=1e-9)
 
 
-def test_a_sixth_is_trimmed_at_either_end():
-    gains = np.array([np.nan, 1e9, 1.0, 2.0, 3.0, 4.0])
-    assert ahead(gains, np.zeros(6)) == pytest.approx(6 * 2.5)
+def test_one_fit_is_ahead_of_another_by_what_it_is_likelier_less_a_sixth_at_either_end():
+    assert ahead(np.array([np.nan, 1e9, 1.0, 2.0, 3.0, 4.0]), np.zeros(6)) == pytest.approx(6 * 2.5)
     assert ahead(np.array([1.0, 2.0]), np.zeros(2)) == pytest.approx(3.0)
-
-
-def test_one_fit_is_ahead_of_another_by_what_it_is_likelier():
-    one, other = (_emstate(MODEL, top) for top in (5.0, 3.0))
-    assert ahead(one.top, other.top) == pytest.approx(12.0)
+    assert ahead(np.full(6, 5.0), np.full(6, 3.0)) == pytest.approx(12.0)
 
 
 @pytest.mark.parametrize("place", [0, 1, 2])
@@ -121,15 +107,15 @@ def test_one_of_three_effects_goes_with_its_prior_and_its_reason(place):
 
 
 def test_a_rest_belongs_to_the_law_of_the_same_signals_at_its_joint():
-    model = with_effects(MODEL, (_law("motor_gain"), _spring()))
+    model = with_effects(MODEL, (_law("motor_gain"), SPRING))
     assert remainder_of(_function(), model) == 1
-    assert remainder_of(_of_input(), model) == 0
+    assert remainder_of(OF_INPUT, model) == 0
     assert remainder_of(dataclasses.replace(_function(), joint=2), model) is None
-    assert remainder_of(_spring(), model) is None
+    assert remainder_of(SPRING, model) is None
     assert remainder_of(_function(), with_effects(MODEL, (_law("motor_gain"), _law("air_drag")))) is None
     free = with_effects(MODEL, (_function(),))
-    assert completed(_spring(), free) and not completed(_spring(), model) and not completed(_law("motor_gain"), free)
-    assert completed(_law("motor_gain"), with_effects(MODEL, (_of_input(),)))
+    assert completed(SPRING, free) and not completed(SPRING, model) and not completed(_law("motor_gain"), free)
+    assert completed(_law("motor_gain"), with_effects(MODEL, (OF_INPUT,)))
 
 
 def test_a_fit_starts_where_the_screen_puts_a_linear_law_and_at_the_probe_of_another():
@@ -157,16 +143,6 @@ def test_a_function_of_each_turn_and_one_of_all_turns_are_rivals():
     assert replaced(spring, model) is None
 
 
-def test_one_repeats_each_turn_and_the_other_does_not():
-    """Both are the same bump near zero; a turn further on only the one is there again."""
-    turning, still = _functions(2, "theta2")
-    for effect, again in ((turning, 1.0), (still, 0.0)):
-        basis = jax.vmap(effect.axes[0].basis)(np.array([1.0, 1.0 + 2 * np.pi]))
-        first, second = basis[:, int(np.argmax(basis[0]))]
-        assert first > 0.8
-        np.testing.assert_allclose(second, again * first, atol=1e-6)
-
-
 def test_a_stop_that_yields_is_none():
     """One that a typical torque pushes in by half a radian, or whose ends nearly meet, is a spring in disguise."""
     stop = next(c for c in catalogue["hard_stop"].candidates(AROUND) if c.start.joint == 2).probes[0]
@@ -191,20 +167,19 @@ def _context(stages=None) -> SearchContext:
     )
 
 
+def _patched(monkeypatch, module, **values) -> None:
+    for name, value in values.items():
+        monkeypatch.setattr(module, name, value)
+
+
 @pytest.mark.parametrize(("worse", "kept"), [(0.9, 7.0), (1.1, 0.0)])
 def test_a_fit_that_predicts_worse_than_what_it_began_from_is_not_kept(monkeypatch, worse, kept):
-    tops = []
-
     def fit(state, data, smoother, m_step, *, epochs, schedule):
-        tops.append(0.0 if epochs == 2 else 7.0)  # one epoch, which only judges the model as it is
-        return _emstate(state.model, tops[-1])
+        return _emstate(state.model, 0.0 if epochs == 2 else 7.0)  # one epoch, which only judges the model as it is
 
-    monkeypatch.setattr(context_of, "fit", fit)
-    monkeypatch.setattr(context_of, "_afresh", lambda *_: None)
-    monkeypatch.setattr(context_of, "smooth", lambda *_: (SMOOTHED, np.ones(6, bool)))
-    monkeypatch.setattr(context_of, "followed", lambda *_: None)
-    monkeypatch.setattr(context_of, "errors", lambda *_: None)
-    monkeypatch.setattr(context_of, "ratio", lambda *_: worse)
+    nothing = dict.fromkeys(("_afresh", "followed", "errors"), lambda *_: None)
+    smoothed = lambda *_: (SMOOTHED, np.ones(6, bool))  # noqa: E731
+    _patched(monkeypatch, context_of, fit=fit, smooth=smoothed, ratio=lambda *_: worse, **nothing)
     assert context_of.extend(_context(), _with("motor_gain"), 9).top[0] == kept
 
 
@@ -228,7 +203,11 @@ def _pretend(monkeypatch, worth: dict[str, float], others=()):
         ((0.5, 0.06), _with("motor_gain", "dead_zone"), ["motor_gain", "dead_zone"]),
         ((0.5, 0.06), _with("dead_zone", "motor_gain"), ["dead_zone", "motor_gain"]),
         ((0.01, 0.02), _with("motor_gain", "dead_zone"), []),
-        ((0.0, 0.5), BARE.plus(_law("dead_zone", -1.0), _candidate("dead_zone"), _found(0.5)), []),  # without meaning
+        (
+            (0.0, 0.5),
+            BARE.plus(_law("dead_zone", -1.0), _candidate("dead_zone"), Evidence(removed=0.5)),
+            [],
+        ),  # without meaning
     ],
 )
 def test_a_law_goes_without_which_too_little_is_lost(monkeypatch, worth, hypothesis, stay):
@@ -246,88 +225,66 @@ def _case(law, removed: float = 0.5) -> Trial:
     return Trial(screened, BARE.plus(law, screened.candidate), removed, 12.0, np.inf)
 
 
-def _rounds(monkeypatch, *laws):
-    """Rounds that accept these laws in turn, then none; returns the numbers of rows at which they looked."""
-    lengths, queue = [], list(laws)
+def _rounds(monkeypatch, *queue):
+    """Rounds that accept these laws in turn, then none; a number: so many candidates are left, as the time is up."""
+    left = list(queue)
 
     def screening_round(fit, context):
-        law = queue.pop(0) if queue else None
-        step = Step(fit.rows, (), (), None if law is None else key_of(law), 400, context.loss.measure)
-        if law is None:
-            return Round(step, None)
+        law = left.pop(0) if left else None
+        if isinstance(law, Exception):
+            raise law
+        step = Step(fit.rows, (), (), None, 400, context.loss.measure)
+        if law is None or isinstance(law, int):
+            return Round(step._replace(untried=law or 0), None, complete=law is None)
         case = _case(law)
-        return Round(step, case._replace(after=fit.hypothesis.plus(law, case.screened.candidate)))
+        return Round(step._replace(accepted=key_of(law)), case._replace(after=fit.hypothesis.plus(law, case.candidate)))
 
-    smooth = search.smooth
-    monkeypatch.setattr(search, "smooth", lambda *a: (lengths.append(a[2]), smooth(*a))[1])
-    monkeypatch.setattr(search, "release_programs", lambda: None)
-    monkeypatch.setattr(search, "screening_round", screening_round)
-    return lengths
+    _patched(monkeypatch, search, release_programs=lambda: None, screening_round=screening_round)
 
 
-def test_laws_are_added_until_none_is_accepted(monkeypatch):
-    _pretend(monkeypatch, {"motor_gain": 0.4, "air_drag": 0.3})
-    _rounds(monkeypatch, _law("motor_gain", 0.5), _law("air_drag", 0.5))
-    hypothesis, state, steps, complete, _ = search._search(_context(), BARE, None, [9])
-    assert _names(hypothesis.model) == ["motor_gain", "air_drag"] and state is not None and complete
-    assert [step.accepted is not None for step in steps] == [True, True, False]
-    record = hypothesis.evidence[0]
-    assert (record.removed, record.share, record.chance, record.parts) == (0.5, 0.4, 0.0, (3, 3))
-    assert np.isnan(record.gain)  # a likelihood proves nothing there
+LOST = np.linalg.LinAlgError("Singular matrix")
+GAIN, DRAG = _law("motor_gain", 0.5), _law("air_drag", 0.5)
+SEARCHES = {  # rounds, what a gain is worth, the laws at the end, by round whether one was accepted, whether it ended
+    "until none is accepted": ((GAIN, DRAG), 0.4, ["motor_gain", "air_drag"], [1, 1, 0], True),
+    "accepted in every round, needless in every backward pass": ((GAIN, None, GAIN), 0.01, [], [1, 0], True),
+    "its time is up before the second screen": ((GAIN, TimeUp()), 0.4, ["motor_gain"], [1], False),
+    "its time is up with candidates left": ((GAIN, 3), 0.4, ["motor_gain"], [1, 0], False),
+    "a matrix is singular in the second round": ((GAIN, LOST), 0.4, ["motor_gain"], [1], False),
+}
 
 
-def test_a_search_ends_where_what_was_added_goes_again(monkeypatch):
-    """Accepted in every round, and needless in every backward pass."""
-    _pretend(monkeypatch, {"motor_gain": 0.01})
-    _rounds(monkeypatch, _law("motor_gain", 0.5), None, _law("motor_gain", 0.5), None)
-    hypothesis, state, steps, complete, _ = search._search(_context(), BARE, None, [9])
-    assert hypothesis.evidence == () and state is None and len(steps) == 2 and complete
+@pytest.mark.parametrize(("queue", "worth", "names", "accepted", "complete"), SEARCHES.values(), ids=SEARCHES)
+def test_a_search_keeps_what_was_accepted_before(monkeypatch, queue, worth, names, accepted, complete):
+    _pretend(monkeypatch, {"motor_gain": worth, "air_drag": 0.3})
+    _rounds(monkeypatch, *queue)
+    hypothesis, state, steps, ended, failure = search._search(_context(), BARE, None, [9])
+    assert _names(hypothesis.model) == names and (state is not None) == bool(names) and ended == complete
+    assert [step.accepted is not None for step in steps] == [each == 1 for each in accepted]
+    assert steps[-1].untried == (3 if 3 in queue else 0) and failure == ("Singular matrix" if LOST in queue else "")
+    for record in hypothesis.evidence:
+        assert (record.removed, record.share, record.chance, record.parts) == (0.5, 0.4, 0.0, (3, 3))
+        assert np.isnan(record.gain)  # a likelihood proves nothing there
 
 
-@pytest.mark.parametrize("left", [0, 3])
-def test_a_search_whose_time_is_up_keeps_what_was_accepted_before(monkeypatch, left):
-    """In the second round: before its screen, or with candidates left that were not refitted."""
+@pytest.mark.parametrize("late", [True, False])
+def test_a_search_that_fails_says_so(monkeypatch, late):
+    """At the end of the fit, or in its second round."""
+
+    def release(fitted, data):
+        if late:
+            raise LOST
+        return fitted
+
     _pretend(monkeypatch, {"motor_gain": 0.4})
-    _rounds(monkeypatch, _law("motor_gain", 0.5))
-    rounds = search.screening_round
-
-    def late(fit, context):
-        if not fit.hypothesis.evidence:
-            return rounds(fit, context)
-        if not left:
-            raise TimeUp
-        return Round(Step(9, (), (), None, 400, untried=left), None, complete=False)
-
-    monkeypatch.setattr(search, "screening_round", late)
-    hypothesis, state, steps, complete, _ = search._search(_context(), BARE, None, [9])
-    assert _names(hypothesis.model) == ["motor_gain"] and state is not None and not complete
-    assert [step.untried for step in steps] == ([0, left] if left else [0])
-
-
-def test_a_search_that_fails_late_keeps_what_was_accepted_before(monkeypatch):
-    """By a matrix that is singular in the second round, or at the end of the fit."""
-    _pretend(monkeypatch, {"motor_gain": 0.4})
-    monkeypatch.setattr(search, "quantised", lambda context, hypothesis: (hypothesis, None))
-    monkeypatch.setattr(search, "covariances", lambda model, *_: [np.eye(1)] * len(model.effects))
-    monkeypatch.setattr(search, "certainty", lambda *_: math.inf)
-
-    def fail(*_):
-        raise np.linalg.LinAlgError("Singular matrix")
-
-    def outcome(release):
-        _rounds(monkeypatch, _law("motor_gain", 0.5))
-        return search.search(_context(), release=release)
-
-    late, log = outcome(fail), []
-    assert _names(late.after.model) == ["motor_gain"] and len(late.evidence) == 1
-    assert not late.complete and late.failure == "Singular matrix" and "(Singular matrix)" in late.unfinished
-    _rounds(monkeypatch, _law("motor_gain", 0.5))
-    rounds = search.screening_round
-    second = lambda fit, context: fail() if fit.hypothesis.evidence else rounds(fit, context)  # noqa: E731
-    monkeypatch.setattr(search, "screening_round", second)
-    late = search.search(_context()._replace(log=log.append), release=lambda fitted, data: fitted)
-    assert _names(late.after.model) == ["motor_gain"] and [step.accepted is not None for step in late.steps] == [True]
-    assert not late.complete and late.failure == "Singular matrix" and "numerical failure" in log[-1]
+    certain = lambda model, *_: [np.eye(1)] * len(model.effects)  # noqa: E731
+    start = lambda context, hypothesis: (hypothesis, None)  # noqa: E731
+    _patched(monkeypatch, search, quantised=start, covariances=certain, certainty=lambda *_: math.inf)
+    _rounds(monkeypatch, GAIN, *(() if late else (LOST,)))
+    log = []
+    outcome = search.search(_context()._replace(log=log.append), release=release)
+    assert _names(outcome.after.model) == ["motor_gain"] and len(outcome.evidence) == 1
+    assert not outcome.complete and outcome.failure == "Singular matrix" and "(Singular matrix)" in outcome.unfinished
+    assert "numerical failure" in log[-1]
 
 
 def test_no_step_begins_after_the_deadline():
@@ -346,11 +303,11 @@ def test_no_step_begins_after_the_deadline():
 )
 def test_a_named_law_gives_way_to_a_remainder_that_explains_the_larger_part(removed, names):
     """The remainder removes half of what is left by a law that removed nine tenths, or one."""
-    spring = Candidate(_spring(), (_spring(),), _spring())
-    hypothesis = BARE.plus(_spring(), spring, Evidence(removed=removed))
+    spring = Candidate(SPRING, (SPRING,), SPRING)
+    hypothesis = BARE.plus(SPRING, spring, Evidence(removed=removed))
     law = _function()
     case = _case(law)._replace(after=hypothesis.plus(law, _case(law).screened.candidate))
-    following = search._with(hypothesis, case, _found(0.5), _context())
+    following = search._with(hypothesis, case, Evidence(removed=0.5), _context())
     assert _names(following.model) == names
     # the remainder that took the place removed what both did; beside the law only its own
     assert following.evidence[-1].removed == pytest.approx(0.5 if len(names) == 2 else 1 - 0.9 * 0.5)
@@ -372,39 +329,40 @@ def test_a_law_that_is_not_determined_as_it_is_stated_is_a_suspect(monkeypatch, 
     """The gain is 1, of so many standard deviations as stated; the dead zone of 20 is sure."""
     names = ["motor_gain", "dead_zone"] if stays else ["dead_zone"]
     hypothesis = _with("motor_gain", "dead_zone")
-    records = (_found(0.5)._replace(candidate=_candidate("motor_gain"), share=0.3, chance=0.1), _found(0.5))
+    records = (
+        Evidence(removed=0.5)._replace(candidate=_candidate("motor_gain"), share=0.3, chance=0.1),
+        Evidence(removed=0.5),
+    )
     hypothesis = hypothesis._replace(evidence=records)
     spreads = {"motor_gain": np.eye(1) / certain**2, "dead_zone": 0.01 * np.eye(1)}
-    monkeypatch.setattr(search, "covariances", lambda model, *_: [spreads[e.name] for e in model.effects])
-    monkeypatch.setattr(search, "extend", lambda context, one, length: _emstate(one.model, 1.0))
-    monkeypatch.setattr(search, "backward", lambda context, one: one)
+    _patched(
+        monkeypatch,
+        search,
+        covariances=lambda model, *_: [spreads[e.name] for e in model.effects],
+        extend=lambda context, one, length: _emstate(one.model, 1.0),
+        backward=lambda context, one: one,
+    )
     rounds = [Step(9, (), (), key_of(effect), 2) for effect in hypothesis.model.effects]
     state, log = _emstate(hypothesis.model, 1.0), []
     context = _context()._replace(log=log.append, pieces=pieces, white=white)
     left, outcome, steps = search._determined(context, hypothesis, state, rounds, lambda fitted, data: fitted)
     assert _names(left.model) == _names(outcome.model) == names
     dropped = key_of(hypothesis.model.effects[0])
-    assert steps[0].accepted == (dropped if len(names) == 2 else None) and steps[1].accepted is not None
-    assert steps[-1].suspects == (() if len(names) == 2 else (Suspect(dropped, 0.3, 0.1),))
-    assert log == (
-        []
-        if len(names) == 2
-        else [f"  motor gain at joint 1 is removed: it is {certain} standard deviations from none after its refit"]
-    )
+    assert steps[0].accepted == (dropped if stays else None) and steps[1].accepted is not None
+    assert steps[-1].suspects == (() if stays else (Suspect(dropped, 0.3, 0.1),))
+    line = f"  motor gain at joint 1 is removed: it is {certain} standard deviations from none after its refit"
+    assert log == ([] if stays else [line])
 
 
 def test_a_search_begins_at_the_whole_length_unless_most_sequences_are_lost_there():
+    """Its ladder of horizons begins where the fit was short: the two shortest horizons of at most 150 rows, and one in
+    the middle; the whole comes of itself.
+    """
     state, every, most, few = _emstate(MODEL, 0.0), np.ones(6, bool), np.arange(6) < 3, np.arange(6) < 2
-    assert search._first(_context(stages={4: (state, every), 9: (state, most)})) == 9
-    assert search._first(_context(stages={4: (state, every), 9: (state, few)})) == 4
-    assert search._first(_context(stages={4: (state, few), 9: (state, few)})) == 4
-
-
-def test_the_ladder_of_horizons_begins_where_the_fit_was_short():
-    """The two shortest horizons of at most 150 rows, and one in the middle; the whole comes of itself."""
-    whole = DATA._replace(**{name: np.zeros((1, 500, *np.shape(getattr(DATA, name))[2:])) for name in ("t", "u", "y")})
-    context = _context(stages=dict.fromkeys([60, 96, 154, 246, 393, 500]))
-    context = context._replace(data=whole._replace(valid=np.ones((1, 500), bool)))
+    for short, whole, first in ((every, most, 9), (every, few, 4), (few, few, 4)):
+        assert search._first(_context(stages={4: (state, short), 9: (state, whole)})) == first
+    long = Dataset(*(np.zeros((1, 500, *part.shape[2:])) for part in DATA[:3]), np.ones((1, 500), bool))
+    context = _context(stages=dict.fromkeys([60, 96, 154, 246, 393, 500]))._replace(data=long)
     assert search._ladder(context) == [60, 96, 246]
 
 
@@ -424,15 +382,19 @@ def test_external_disturbances_are_sought_where_noise_is_not_what_the_model_says
         before = _context().before
         return before._replace(smoother=smoother(before.bank))
 
-    monkeypatch.setattr(search, "identify", identify)
-    monkeypatch.setattr(search, "_search", run)
-    monkeypatch.setattr(search, "quantised", lambda context, hypothesis: (hypothesis, None))
-    monkeypatch.setattr(search, "white_readings", lambda data, _: white or bool(cut))
-    monkeypatch.setattr(search, "covariances", lambda model, rule, hessian: [np.eye(1)] * len(model.effects))
-    monkeypatch.setattr(search, "finished", lambda fitted, data: fitted)
-    monkeypatch.setattr(search, "_released", lambda rig: search.finished)
-    monkeypatch.setattr(search, "begin", lambda rig, data, key: _context().before)
-    monkeypatch.setattr(search, "disturbance_free", disturbance_free)
+    _patched(
+        monkeypatch,
+        search,
+        identify=identify,
+        _search=run,
+        quantised=lambda context, hypothesis: (hypothesis, None),
+        white_readings=lambda data, _: white or bool(cut),
+        covariances=lambda model, rule, hessian: [np.eye(1)] * len(model.effects),
+        finished=lambda fitted, data: fitted,
+        _released=lambda rig: search.finished,
+        begin=lambda rig, data, key: _context().before,
+        disturbance_free=disturbance_free,
+    )
     outcome = search.diagnose(RIG, DATA, key=jax.random.key(0))
     assert len(outcome.evidence) == 1 and outcome.complete
     assert outcome.before.smoother.second() is not None and outcome.after.smoother.second() is not None
@@ -446,7 +408,7 @@ def test_a_law_of_a_rate_is_judged_by_that_reading_too(monkeypatch, channel, lef
     _pretend(monkeypatch, {})
     ratio = lambda self, null, full, fit, band, see=(): left if see == (1,) else 0.95  # noqa: E731
     monkeypatch.setattr(MultiStep, "ratio", ratio)
-    hypothesis = BARE.plus(law, Candidate(law, (law,), law), _found(0.85))
+    hypothesis = BARE.plus(law, Candidate(law, (law,), law), Evidence(removed=0.85))
     assert bool(backward.backward(_context(), hypothesis).evidence) == stays
 
 
@@ -465,7 +427,7 @@ def test_what_explains_clearly_more_takes_the_place_of_a_law(monkeypatch, worth,
     other = _case(law, worth)._replace(after=BARE.plus(law, _candidate("dead_zone")))
     other = other._replace(refit=_refit(other.after.model))
     _pretend(monkeypatch, {"air_drag": 0.5, "dead_zone": worth}, [other])
-    evidence = _found(0.5)._replace(equivalent=(key_of(law), key_of(_law("motor_gain"))))
+    evidence = Evidence(removed=0.5)._replace(equivalent=(key_of(law), key_of(_law("motor_gain"))))
     hypothesis = BARE.plus(_law("air_drag", 1.0), _candidate("air_drag"), evidence)
     after = backward.backward(_context(), hypothesis)
     assert _names(after.model) == [name]
@@ -476,14 +438,19 @@ def test_what_explains_clearly_more_takes_the_place_of_a_law(monkeypatch, worth,
 def test_an_equivalent_that_the_motion_does_not_show_takes_no_place(monkeypatch, seen):
     """As a cogging of one period a turn that of a spring, where less than a turn was visited."""
     tried = []
-    monkeypatch.setattr(backward, "surroundings", lambda *_, **__: None)
-    monkeypatch.setattr(backward, "proposals", lambda *_: [_candidate("motor_gain")])
-    monkeypatch.setattr(catalogue["motor_gain"], "visible", lambda *_: seen)
-    monkeypatch.setattr(backward, "screen", lambda _, fit, some, shifts: tried.extend(some) or ())
-    evidence = _found(0.5)._replace(equivalent=(key_of(_law("motor_gain")),))
-    assert not list(
-        backward._in_place(_context(), key_of(_law("air_drag")), evidence, SMOOTHED, Null(*2 * [_refit(MODEL)]))
+    _patched(
+        monkeypatch,
+        backward,
+        surroundings=lambda *_, **__: None,
+        proposals=lambda *_: [_candidate("motor_gain")],
+        screen=lambda _, fit, some, shifts: tried.extend(some) or (),
     )
+    monkeypatch.setattr(catalogue["motor_gain"], "visible", lambda *_: seen)
+    evidence, null = (
+        Evidence(removed=0.5)._replace(equivalent=(key_of(_law("motor_gain")),)),
+        Null(*2 * [_refit(MODEL)]),
+    )
+    assert not list(backward._in_place(_context(), key_of(_law("air_drag")), evidence, SMOOTHED, null))
     assert bool(tried) == seen
 
 
@@ -495,11 +462,37 @@ def test_ratios_of_noise_are_held_at_those_of_the_first_model():
     np.testing.assert_array_equal(hypothesis.m_step.log_q_prior, [-3.0, -4.0])
 
 
-def test_numbers_are_held_in_a_search_and_released_at_its_end(monkeypatch):
-    """A fifth of the declared standard deviation, and the declared one for all that is reported."""
+HELD = {  # measured, white readings, the share of the declared standard deviation of numbers, and the first rounds
+    "all is read, in noise that is not white": ((0, 1), False, 0.2, [9]),
+    "all is read, in white noise": ((0, 1), True, 1.0, [9]),
+    "a joint is hidden": ((1,), False, 1.0, [9]),
+    "a joint is hidden, in white noise": ((1,), True, 1.0, [4, 6]),
+}
+
+
+@pytest.mark.parametrize(("measured", "white", "share", "lengths"), HELD.values(), ids=HELD)
+def test_numbers_are_held_and_rounds_begin(monkeypatch, measured, white, share, lengths):
+    """At short horizons where a joint is hidden and readings are white: numbers are free there, too."""
     rig = dataclasses.replace(RIG, parameters={"m": Declared(1.0, 0.5)})
-    held, share = search._held(rig, MODEL, False)
-    assert share == 0.2 and held.parameters["m"].mean == 1.0 and held.parameters["m"].std == pytest.approx(0.1)
+    model, seen, context = dataclasses.replace(MODEL, measured=measured), [], _context()
+    held, part = search._held(rig, model, white)
+    assert part == share and (m := held.parameters["m"]).mean == 1.0 and m.std == pytest.approx(0.5 * share)
+    before = context.before._replace(state=context.before.state._replace(model=model, best=model))
+    _patched(
+        monkeypatch,
+        search,
+        quantised=lambda context, hypothesis: (hypothesis, None),
+        _ladder=lambda _: [4, 6],
+        _search=lambda *args: seen.append(args[-1]) or search._Searched(BARE, None, []),
+    )
+    search.search(context._replace(before=before, white=white), release=lambda fitted, data: fitted)
+    assert seen == [lengths]
+
+
+def test_held_numbers_are_released_at_the_end(monkeypatch):
+    """All that is reported has the declared standard deviation, and the curvature by it."""
+    rig = dataclasses.replace(RIG, parameters={"m": Declared(1.0, 0.5)})
+    held, _ = search._held(rig, MODEL, False)
     before = _context().before._replace(rig=held, smoother=search.unbranched(StartBank((1, 1), (0,))))
     stds = []
 
@@ -507,33 +500,9 @@ def test_numbers_are_held_in_a_search_and_released_at_its_end(monkeypatch):
         stds.append(float(rule.prior.std[0]))
         return model, MStepInfo(jnp.full((1, 1), 7.0), np.ones(6, bool))
 
-    monkeypatch.setattr(search, "e_step", lambda *_, **__: None)
+    _patched(monkeypatch, search, e_step=lambda *_, **__: None, finished=lambda fitted, data: fitted)
     monkeypatch.setattr(type(RULE), "__call__", step)
-    monkeypatch.setattr(search, "finished", lambda fitted, data: fitted)
     after = search._released(rig)(before, DATA)
     assert stds == [pytest.approx(float(RULE.prior.std[0]) / 0.2)] and after.rig is rig
     assert float(after.m_step.prior.std[0]) == stds[0] and float(after.state.hessian[0, 0]) == 7.0
     assert after.model is before.model
-
-
-@pytest.mark.parametrize(("measured", "white"), [((0, 1), True), ((1,), False)])
-def test_declared_numbers_are_free_where_readings_are_white_or_a_joint_is_hidden(measured, white):
-    rig = dataclasses.replace(RIG, parameters={"m": Declared(1.0, 0.5)})
-    assert search._held(rig, dataclasses.replace(MODEL, measured=measured), white) == (rig, 1.0)
-
-
-@pytest.mark.parametrize(
-    ("measured", "white", "lengths"), [((0, 1), True, [9]), ((1,), True, [4, 6]), ((1,), False, [9])]
-)
-def test_where_a_joint_is_hidden_and_readings_are_white_rounds_begin_at_short_horizons(
-    monkeypatch, measured, white, lengths
-):
-    seen, context = [], _context()
-    model = dataclasses.replace(MODEL, measured=measured)
-    before = context.before._replace(state=context.before.state._replace(model=model, best=model))
-    context = context._replace(before=before, white=white)
-    monkeypatch.setattr(search, "quantised", lambda context, hypothesis: (hypothesis, None))
-    monkeypatch.setattr(search, "_ladder", lambda _: [4, 6])
-    monkeypatch.setattr(search, "_search", lambda *args: seen.append(args[-1]) or search._Searched(BARE, None, []))
-    search.search(context, release=lambda fitted, data: fitted)
-    assert seen == [lengths]

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from helpers import PENDULUM, rig_text, written_again
+from helpers import PENDULUM, rig_text, servo_model, written_again
 
 from nnap_em.data.dataset import Dataset
 from nnap_em.data.logs import Logs
@@ -21,7 +21,7 @@ from nnap_em.effects.actuator import DeadZone, InputDelay, MotorGain, Saturation
 from nnap_em.em.build import build, build_system, measure_scales
 from nnap_em.em.servos import build_servos
 from nnap_em.export.model import ExportError, write_model
-from nnap_em.fit.check import ERROR, OK, WARNING, check
+from nnap_em.fit.check import ERROR, OK, WARNING, check, drives
 from nnap_em.fit.identifiability import identifiability, sentences
 from nnap_em.fit.identify import identify, parameter_table
 from nnap_em.fit.predict import horizon_errors, predict
@@ -75,34 +75,32 @@ def _logs(u: np.ndarray, y: np.ndarray | None = None, dt: float = 0.01) -> Datas
     return Dataset(t, u, np.zeros((*u.shape[:2], 1)) if y is None else y, np.ones(u.shape[:2], bool))
 
 
-def _model(rig: Rig, effects=()):
-    swing = np.sin(np.arange(40.0))[None, :, None]
-    u, y = (np.repeat(swing, len(names), axis=2) for names in (rig.input_columns, rig.measured))
-    data = _logs(u, 0.1 * y)
-    return with_effects(build(rig, data, key=jax.random.key(0)).model, effects)
+def _drives(models, x, u) -> list[np.ndarray]:
+    """Generalised forces of some models at states under commands that stand still, a row each, in one program."""
 
+    def of(model, x, u):
+        rows = Dataset(0.01 * jnp.arange(4.0), jnp.tile(u, (4, 1)), jnp.zeros((4, 1)), jnp.ones(4, bool))
+        return model.scene(x, jax.tree.map(lambda a: a[-1], model.inputs(rows))).drive
 
-def _row(model, u: float):
-    seq = _logs(np.full((1, 4, 1), u))
-    return jax.tree.map(lambda a: a[-1], model.inputs(jax.tree.map(lambda a: jnp.asarray(a[0]), seq)))
+    each = [jax.vmap(lambda x, u, model=model: of(model, x, u)) for model in models]
+    return jax.jit(lambda x, u: [one(x, u) for one in each])(jnp.asarray(x), jnp.asarray(u))
 
 
 @pytest.mark.parametrize("name", ACTUATORS)
 def test_a_servo_of_a_file_gives_the_force_of_mujoco(tmp_path, name):
     more = 'actuatorfrcrange="-15 15"' if name == "limited at its joint" else ""
     rig = _of_file(tmp_path, ACTUATORS[name], more=more)
-    model, compiled = _model(rig), mujoco.MjModel.from_xml_path(str(tmp_path / "machine.xml"))
-    data, rng, seen = mujoco.MjData(compiled), np.random.default_rng(0), []
-    for _ in range(12):
-        data.qpos[:], data.qvel[:] = rng.uniform(-2.0, 2.0, (2, 2))
-        data.ctrl[0] = rng.uniform(0.0, 3.0)
+    compiled, rng = mujoco.MjModel.from_xml_path(str(tmp_path / "machine.xml")), np.random.default_rng(0)
+    data, truth = mujoco.MjData(compiled), []
+    x, u = rng.uniform(-2.0, 2.0, (12, 4)), rng.uniform(0.0, 3.0, (12, 1))
+    for state, push in zip(x, u, strict=True):
+        data.qpos[:], data.qvel[:] = np.split(state, 2)
+        data.ctrl[:] = push
         mujoco.mj_forward(compiled, data)
-        x = jnp.concatenate([jnp.asarray(data.qpos), jnp.asarray(data.qvel)])
-        drive = model.scene(x, _row(model, float(data.ctrl[0]))).drive
-        np.testing.assert_allclose(drive, data.qfrc_actuator, atol=1e-10)
-        seen.append(np.abs(data.qfrc_actuator).max())
+        truth.append(data.qfrc_actuator.copy())
+    np.testing.assert_allclose(_drives([servo_model(rig)], x, u)[0], truth, atol=1e-10)
     assert rig.input_kinds == (name if name in KINDS else "velocity" if "at its joint" in name else rig.input_kinds[0],)
-    assert len(set(np.round(seen, 9))) > 1
+    assert len(set(np.round(np.abs(truth).max(axis=1), 9))) > 1
 
 
 def test_every_kind_has_a_law():
@@ -115,13 +113,12 @@ def test_a_slide_on_a_servo_swings_as_its_closed_form(tmp_path):
     Tolerance: the fourth-order method at STIFF = 0.5 loses (w h)^5 / 120 of the phase in a step.
     """
     rig = _servo(tmp_path, 'kind = "position"\nkp = 160000.0', model=SLIDE, read=("x",))
-    model = _model(dataclasses.replace(rig, friction=False))
     w, rows = 400.0, 12
-    row = _row(model, 0.5)
-    x, positions = jnp.zeros(2), []
-    for _ in range(rows):
-        positions.append(x[0])
-        x = model.transition(x, row)
+    logs = _logs(np.full((1, 40, 1), 0.5), 0.1 * np.sin(np.arange(40.0))[None, :, None])
+    model = build(dataclasses.replace(rig, friction=False), logs, key=jax.random.key(0)).model
+    row = jax.tree.map(lambda a: a[-1], model.inputs(jax.tree.map(lambda a: jnp.asarray(a[0]), logs)))
+    step = lambda x, _: (model.transition(x, row), x[0])  # noqa: E731
+    _, positions = jax.jit(lambda: jax.lax.scan(step, jnp.zeros(2), length=rows))()
     assert model.steps == 9
     np.testing.assert_allclose(positions, 0.5 * (1 - np.cos(w * 0.01 * np.arange(rows))), atol=0.02)
 
@@ -129,48 +126,57 @@ def test_a_slide_on_a_servo_swings_as_its_closed_form(tmp_path):
 def test_a_late_command_is_that_of_earlier_rows_and_stood_before_the_first(tmp_path):
     u = np.cumsum(np.random.default_rng(0).normal(size=(1, 20, 1)), axis=1)
     seq = jax.tree.map(lambda a: jnp.asarray(a[0]), _logs(u))
-    late = _model(_servo(tmp_path, 'kind = "position"\nkp = 3.0\ndelay = 0.03')).inputs(seq)
+    declared = servo_model(_servo(tmp_path, 'kind = "position"\nkp = 3.0\ndelay = 0.03'))
+    lacking = servo_model(_servo(tmp_path, 'kind = "position"\nkp = 3.0'), (InputDelay.of(0.03, joint=1),))
+    late, other = jax.jit(lambda seq: (declared.inputs(seq), lacking.inputs(seq)))(seq)
     np.testing.assert_allclose(late.u, 3.0 * np.concatenate([np.repeat(seq.u[:1], 3, axis=0), seq.u[:-3]]), rtol=1e-12)
     np.testing.assert_allclose(late.before[1:], late.u[:-1])
-    undeclared = _model(_servo(tmp_path, 'kind = "position"\nkp = 3.0'), (InputDelay.of(0.03, joint=1),))
-    np.testing.assert_allclose(undeclared.inputs(seq).u, late.u, rtol=1e-12)
+    np.testing.assert_allclose(other.u, late.u, rtol=1e-12)
 
 
 def test_laws_of_a_moment_act_on_the_torque_of_a_servo(tmp_path):
     plain = _servo(tmp_path, 'kind = "position"\nkp = 3.0\nkd = 0.5')
-    x, u = jnp.asarray([0.4, -1.0]), 2.0
-    torque = 3.0 * (u - 0.4) + 0.5
-    laws = [
-        (MotorGain.of(-0.2, joint=1), 0.8 * torque),
-        (DeadZone.of(0.3, joint=1), torque - 0.3),
-        (Saturation.of(1.5, joint=1), 1.5),
-    ]
-    for law, expected in laws:
-        model = _model(plain, (law,))
-        np.testing.assert_allclose(model.scene(x, _row(model, u)).drive, [expected], rtol=1e-12)
+    torque = 3.0 * (2.0 - 0.4) + 0.5
+    laws = MotorGain.of(-0.2, joint=1), DeadZone.of(0.3, joint=1), Saturation.of(1.5, joint=1)
+    drives = _drives([servo_model(plain, (law,)) for law in laws], [[0.4, -1.0]], [[2.0]])
+    np.testing.assert_allclose(np.ravel(drives), [0.8 * torque, torque - 0.3, 1.5], rtol=1e-12)
 
 
 def test_a_voltage_is_a_velocity_servo_of_its_own_gain(tmp_path):
     k, r = 0.3, 2.0
-    driven = _model(_servo(tmp_path, f'kind = "voltage"\nk = {k}\nR = {r}\nlimit = 0.4\nbias = 0.01'))
-    servo = _model(_servo(tmp_path, f'kind = "velocity"\nkv = {k * k / r}\nlimit = 0.4\nbias = 0.01'))
-    for u, v in ((3.0, 1.0), (-0.2, 2.0), (9.0, -4.0)):
-        x = jnp.asarray([0.1, v])
-        drives = [m.scene(x, _row(m, w)).drive for m, w in ((driven, u), (servo, u / k))]
-        np.testing.assert_allclose(*drives, rtol=1e-12)
+    driven = servo_model(_servo(tmp_path, f'kind = "voltage"\nk = {k}\nR = {r}\nlimit = 0.4\nbias = 0.01'))
+    servo = servo_model(_servo(tmp_path, f'kind = "velocity"\nkv = {k * k / r}\nlimit = 0.4\nbias = 0.01'))
+    x, u = [[0.1, 1.0], [0.1, 2.0], [0.1, -4.0]], np.array([[3.0], [-0.2], [9.0]])
+    np.testing.assert_allclose(_drives([driven], x, u)[0], _drives([servo], x, u / k)[0], rtol=1e-12)
 
 
-def test_the_drive_along_states_is_that_of_the_model_with_the_laws(tmp_path):
-    laws = (InputDelay.of(0.013, joint=1), Saturation.of(1.5, joint=1))
-    rng = np.random.default_rng(2)
-    seq = jax.tree.map(lambda a: jnp.asarray(a[0]), _logs(rng.normal(size=(1, 12, 1))))
-    x = jnp.asarray(rng.normal(size=(12, 2)))
-    for lines in ('kind = "position"\nkp = 3.0\nkd = 0.5', 'kind = "torque"'):
-        rig = _servo(tmp_path, lines)
-        plain, whole = _model(rig), _model(rig, laws)
-        along = plain.driving(laws, x, plain.inputs(seq))
-        at = jax.vmap(lambda x, u, model=whole: model.scene(x, u).drive)(x, whole.inputs(seq))
-        np.testing.assert_allclose(along, at, rtol=1e-12)
+@pytest.mark.parametrize("lines", ['kind = "position"\nkp = 3.0\nkd = 0.5', 'kind = "torque"'], ids=["servo", "torque"])
+def test_the_drive_along_states_is_that_of_the_model_with_the_laws(tmp_path, lines):
+    """Columns of candidates are its changes by each law, at the same states."""
+    laws, rng = (
+        (InputDelay.of(0.013, joint=1), Saturation.of(0.5, joint=1), MotorGain.of(-0.2, joint=1)),
+        np.random.default_rng(4),
+    )
+    data = jax.tree.map(jnp.asarray, _logs(np.repeat(rng.normal(size=(1, 6, 1)), 4, axis=1)))
+    seq, plain = jax.tree.map(lambda a: a[0], data), servo_model(_servo(tmp_path, lines))
+    mean = 0.3 * jnp.asarray(rng.normal(size=(1, 24, 2)))
+    track = tracks(plain, Gaussian(mean, jnp.zeros((1, 24, 2, 2))), jax.vmap(plain.inputs)(data))
+    force = candidate_columns(plain, [Candidate(law, (law,), law) for law in laws])(track).force[0]
+
+    def drive(x, seq, effects=()):
+        whole = with_effects(plain, effects)
+        return jax.vmap(lambda x, u: whole.scene(x, u).drive)(x, whole.inputs(seq))
+
+    along, at, (bare, *with_law) = jax.jit(
+        lambda x, seq: (
+            plain.driving(laws[:2], x, plain.inputs(seq)),
+            drive(x, seq, laws[:2]),
+            [drive(x, seq, effects) for effects in ((), *((law,) for law in laws))],
+        )
+    )(track.middle[0], seq)
+    np.testing.assert_allclose(along, at, rtol=1e-12)
+    assert np.abs(force).max(axis=(1, 2)).min() > 0.1
+    np.testing.assert_allclose(force, np.stack(with_law) - np.asarray(bare), atol=1e-6)
 
 
 def test_a_torque_beside_a_servo_is_as_it_was(tmp_path):
@@ -179,15 +185,14 @@ def test_a_torque_beside_a_servo_is_as_it_was(tmp_path):
     both = _rig(tmp_path, text + '[input.goal]\nkind = "position"\nkp = 3.0', model=ACROBOT)
     assert both.input_kinds == ("position", "torque")
     laws = (InputDelay.of(0.013, joint=1), MotorGain.of(0.1, joint=1))
+    beside, alone = servo_model(both, laws), servo_model(_rig(tmp_path, text, model=ACROBOT), laws)
     rng = np.random.default_rng(1)
-    seq = jax.tree.map(lambda a: jnp.asarray(a[0]), _logs(rng.normal(size=(1, 30, 2))))
-    x = jnp.asarray(rng.normal(size=4))
-    beside = _model(both, laws)
-    alone = _model(_rig(tmp_path, text, model=ACROBOT), laws)
-    for k in (0, 1, 7):
-        rows = [jax.tree.map(lambda a, k=k: a[k], m.inputs(seq)) for m in (beside, alone)]
-        one, two = (m.scene(x, row).drive[0] for m, row in zip((beside, alone), rows, strict=True))
-        np.testing.assert_allclose(one, two, rtol=1e-12)
+    seq, x = (
+        jax.tree.map(lambda a: jnp.asarray(a[0]), _logs(rng.normal(size=(1, 30, 2)))),
+        jnp.asarray(rng.normal(size=4)),
+    )
+    drive = lambda model, seq: jax.vmap(lambda u: model.scene(x, u).drive[0])(model.inputs(seq))  # noqa: E731
+    np.testing.assert_allclose(*jax.jit(lambda seq: (drive(beside, seq), drive(alone, seq)))(seq), rtol=1e-12)
 
 
 # --- what is declared
@@ -323,19 +328,25 @@ def test_what_scales_with_the_gain_and_what_friction_does_is_said(tmp_path):
     [
         ("kp = 12.0\nlimit = 0.2", [ERROR], "the limit is too low; write a higher one"),
         ("kp = 12.0\nlimit = 30.0", [OK], "a position servo, limited to 30 N m"),
-        ("kp = 12.0\ndelay = 1.0", [WARNING], "a delay of 1 s is much of a sequence of 2 s: write it in seconds"),
         ("kp = 1.0e8", None, "stiffest servo would need .* integration steps of a sample, and gets 64"),
     ],
 )
 def test_check_says_what_is_doubtful_about_a_servo(tmp_path, line, marks, said):
     rig = _servo(tmp_path, f'kind = "position"\nkd = 0.4\n{line}')
-    t = 0.01 * np.arange(200)
-    y = 1.2 * np.sin(6.0 * t)[None, :, None]
+    y = 1.2 * np.sin(0.06 * np.arange(200))[None, :, None]
     train = Logs(("a.csv",), _logs(1.1 * y, y), ("goal", "theta1"))
     remarks = [each for each in check(rig, train, None, key=jax.random.key(0)) if each.subject == "servo"]
     assert marks in (None, [each.mark for each in remarks])
     ((mark, _, _),) = (each for each in remarks if re.search(said, each.text))
     assert mark == (ERROR if marks is None else marks[0])  # the gain is one remark beside others
+
+
+def test_a_delay_that_is_much_of_a_sequence_is_doubtful(tmp_path):
+    rig = _servo(tmp_path, 'kind = "position"\nkp = 12.0\ndelay = 1.0')
+    u, torque = np.sin(0.06 * np.arange(200))[None, :, None], np.ones(1)
+    (remark,) = drives(rig, build_system(rig), _logs(u), torque, torque)
+    assert remark.mark == WARNING
+    assert "a delay of 1 s is much of a sequence of 2 s: write it in seconds" in remark.text
 
 
 # --- the fit
@@ -413,21 +424,3 @@ def test_a_servo_with_other_numbers_keeps_its_own():
     servo = Servo("goal", "position", {"kp": jnp.asarray(1.0), "kd": jnp.asarray(2.0)})
     other = servo.with_values({"goal.kp": jnp.asarray(3.0), "elbow.kd": jnp.asarray(4.0)})
     assert (float(other.values["kp"]), float(other.values["kd"])) == (3.0, 2.0)
-
-
-def test_columns_of_candidates_are_changes_of_the_torque_of_the_servo(tmp_path):
-    """The second way is the drive of the model that holds the law, at the same states."""
-    model = _model(_servo(tmp_path, 'kind = "position"\nkp = 3.0\nkd = 0.5'))
-    rng = np.random.default_rng(4)
-    data = jax.tree.map(jnp.asarray, _logs(np.repeat(rng.normal(size=(1, 6, 1)), 4, axis=1)))
-    mean = 0.3 * jnp.asarray(rng.normal(size=(1, 24, 2)))
-    inputs, first = jax.vmap(model.inputs)(data), jax.tree.map(lambda a: a[0], data)
-    track = tracks(model, Gaussian(mean, jnp.zeros((1, 24, 2, 2))), inputs)
-    for law in (Saturation.of(0.5, joint=1), MotorGain.of(-0.2, joint=1), InputDelay.of(0.013, joint=1)):
-        force = candidate_columns(model, [Candidate(law, (law,), law)])(track).force[0, 0]
-        drive = [
-            jax.vmap(lambda x, u, m=m: m.scene(x, u).drive)(track.middle[0], m.inputs(first))
-            for m in (with_effects(model, (law,)), model)
-        ]
-        assert np.abs(force).max() > 0.1
-        np.testing.assert_allclose(force, drive[0] - drive[1], atol=1e-6)

@@ -124,7 +124,7 @@ _FORMS = (_line, _parabola, _hinge, _zone, _bend, _step, _saturation, _bump, _ro
 FORMS = {f.__name__[1:]: f for f in _FORMS} | {"two": _two(TURN, 9), "two on two turns": _two(TURNS, 9)}
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("form", FORMS.values(), ids=FORMS)
 def test_a_known_shape_is_named_with_its_numbers(form, seed):
     rng = np.random.default_rng(seed)
@@ -156,7 +156,7 @@ def test_what_was_not_visited_has_no_say(low, high):
 
 def test_noise_is_no_shape():
     """Random weights whose standard deviations say that they are noise."""
-    for seed in range(20):
+    for seed in range(8):
         rng = np.random.default_rng(seed)
         cov = np.diag(rng.uniform(0.5, 2.0, 20))
         weights = jnp.asarray(np.sqrt(np.diag(cov)) * rng.standard_normal(20))
@@ -166,16 +166,14 @@ def test_noise_is_no_shape():
 
 
 def test_a_curve_without_a_form_is_seldom_given_one():
-    """Random weights that are well known: 20 free numbers, of which a shape may explain 85 % by chance, in 8 of 60."""
+    """Random weights that are well known: 20 free numbers, of which a shape may explain 85 % by chance, in 2 of 15."""
     named = []
-    for seed in range(60):
+    for seed in range(15):
         weights = jnp.asarray(np.random.default_rng(seed).standard_normal(20))
         effect = catalogue["unknown_function"](weights, ((PART, TURN)[seed % 2],), joint=1)
         form = shape(effect.curve(1e-3 * np.eye(20), PENDULUM))
         named += [form.explains] if form.kind != "smooth" else []
-
-    assert len(named) <= 8
-    assert all(explains > 0.85 for explains in named)
+    assert len(named) <= 2 and all(explains > 0.85 for explains in named)
 
 
 def test_all_at_rest_is_told_as_nothing_known():

@@ -122,22 +122,20 @@ def test_recordings_of_one_motion_are_left_out_together():
     assert part[1].tolist() == [4, 4, 5, 5, 6, 6, 7, 7]
 
 
-def test_a_short_beginning_is_no_repetition_of_a_longer_motion():
-    """Five motions from one rest; the first diverged early."""
+def test_what_is_one_motion():
+    """Five motions from one rest, of which the first diverged early, are no repetitions; the pieces of a recording are
+    one motion and lie at their times.
+    """
     rng = np.random.default_rng(0)
     state = np.cumsum(rng.normal(size=(5, 200, 2)), axis=1)
     state[:, :20] = state[0, :20]
     state[0, 12:] = np.nan
     assert motions(state, np.ones(5, bool), np.arange(5)).tolist() == [0, 1, 2, 3, 4]
-
-
-def test_the_pieces_of_a_recording_are_one_motion_and_lie_at_their_times():
-    rng = np.random.default_rng(0)
-    state, used = rng.normal(size=(3, 50, 2)), np.ones(3, bool)
-    assert motions(state, used, np.array([0, 0, 1])).tolist() == [0, 0, 1]
+    pieces = np.array([0, 0, 1])
+    assert motions(rng.normal(size=(3, 50, 2)), np.ones(3, bool), pieces).tolist() == [0, 0, 1]
     t = np.stack([np.arange(50) * 0.1, 5.0 + np.arange(50) * 0.1, np.arange(50) * 0.1])
     data = Dataset(t, t[..., None], t[..., None], np.ones(t.shape, bool))
-    assert times(t[:, ::10], data, np.array([0, 0, 1]), 2).tolist() == [[0] * 5, [1] * 5, [0, 0, 0, 1, 1]]
+    assert times(t[:, ::10], data, pieces, 2).tolist() == [[0] * 5, [1] * 5, [0, 0, 0, 1, 1]]
 
 
 def test_what_happens_at_one_moment_of_every_recording_is_no_law():
@@ -191,24 +189,19 @@ def test_the_placebo_of_a_constant_explains_nothing():
     assert chance < 0.1
 
 
-def test_a_sequence_of_few_moments_takes_no_part_in_a_placebo():
-    columns = np.arange(1.0, 13.0).reshape(1, 3, 1, 4)
-    linearised = Linearised(np.zeros((1, 3, 1)), columns, np.ones((1, 3, 1)), 1.0, np.arange(3))
-    moved = shifted(linearised, 1, np.random.default_rng(0)).columns
-    np.testing.assert_array_equal(moved[..., :1], columns[..., :1])
-    assert not moved[..., 1:].any()
-
-
 def test_a_placebo_moves_the_moments_that_count():
-    """A reading in every fifth row: none of these keeps its column."""
+    """A reading in every fifth row: none of these keeps its column; a sequence of few moments takes no part."""
     columns, weight = np.random.default_rng(0).normal(size=(1, 100, 1, 2)), np.zeros((1, 100, 1))
     weight[:, ::5] = 1.0
-    moved = shifted(
-        Linearised(np.zeros((1, 100, 1)), columns, weight, 1.0, np.arange(100)), 1, np.random.default_rng(1)
-    )
-    before, after = columns[0, ::5, 0, 1], moved.columns[0, ::5, 0, 1]
+    many = Linearised(np.zeros((1, 100, 1)), columns, weight, 1.0, np.arange(100))
+    before, after = columns[0, ::5, 0, 1], shifted(many, 1, np.random.default_rng(1)).columns[0, ::5, 0, 1]
     np.testing.assert_allclose(np.sort(np.abs(before)), np.sort(np.abs(after)))
     assert not np.any(np.isclose(before, after))
+    columns = np.arange(1.0, 13.0).reshape(1, 3, 1, 4)
+    few = Linearised(np.zeros((1, 3, 1)), columns, np.ones((1, 3, 1)), 1.0, np.arange(3))
+    moved = shifted(few, 1, np.random.default_rng(0)).columns
+    np.testing.assert_array_equal(moved[..., :1], columns[..., :1])
+    assert not moved[..., 1:].any()
 
 
 def test_logs_too_short_for_a_fork_say_nothing():

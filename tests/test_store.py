@@ -5,6 +5,7 @@ import hashlib
 import json
 import os
 import pickle
+import shutil
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -73,11 +74,16 @@ def _bits(fitted: Identified) -> list:
     return [one(leaf) for leaf in jax.tree.leaves(tuple(fitted)[1:])]
 
 
-@pytest.fixture
-def file(tmp_path) -> Path:
-    path = tmp_path / "model.npz"
+@pytest.fixture(scope="module")
+def stored(tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("stored") / "model.npz"
     save(path, _fitted())
     return path
+
+
+@pytest.fixture
+def file(tmp_path, stored) -> Path:
+    return Path(shutil.copy(stored, tmp_path))
 
 
 def _rewrite(path: Path, change) -> None:
@@ -148,18 +154,16 @@ def test_a_smoother_from_elsewhere_is_stored_once_it_is_known(tmp_path, monkeypa
     assert isinstance(load(tmp_path / "model.npz").smoother, _Own)
 
 
-def test_settings_of_the_fit_are_kept(tmp_path):
+def test_settings_of_the_fit_are_kept_and_the_same_model_makes_the_same_file(tmp_path):
     fitted = _fitted("slide")
     rule = eqx.tree_at(lambda m: m.ridge, fitted.m_step, 0.25)
     rule = eqx.tree_at(lambda m: m.prior.mean, rule, jnp.zeros(0))
     object.__setattr__(rule, "nodes", 31)  # static
     save(tmp_path / "m.npz", fitted._replace(m_step=rule))
-    assert (load(tmp_path / "m.npz").m_step.nodes, load(tmp_path / "m.npz").m_step.ridge) == (31, 0.25)
-
-
-def test_the_same_model_makes_the_same_file(tmp_path, file):
-    save(tmp_path / "again.npz", load(file))
-    assert (tmp_path / "again.npz").read_bytes() == file.read_bytes()
+    loaded = load(tmp_path / "m.npz")
+    assert (loaded.m_step.nodes, loaded.m_step.ridge) == (31, 0.25)
+    save(tmp_path / "again.npz", loaded)
+    assert (tmp_path / "again.npz").read_bytes() == (tmp_path / "m.npz").read_bytes()
 
 
 def test_a_write_that_fails_leaves_the_old_file(tmp_path, file, monkeypatch):
@@ -175,7 +179,7 @@ def test_a_write_that_fails_leaves_the_old_file(tmp_path, file, monkeypatch):
     assert [path.name for path in tmp_path.iterdir()] == ["model.npz"]
 
 
-@pytest.mark.parametrize("share", [0.0, 0.01, 0.3, 0.9, 0.999])
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.999])
 def test_a_truncated_file_is_refused(file, share):
     content = file.read_bytes()
     file.write_bytes(content[: int(share * len(content))])
@@ -185,7 +189,7 @@ def test_a_truncated_file_is_refused(file, share):
 
 def test_a_flipped_bit_changes_no_number_unnoticed(file):
     content, bits = bytearray(file.read_bytes()), _bits(load(file))
-    for place in np.random.default_rng(1).integers(0, len(content), 60):
+    for place in np.random.default_rng(1).integers(0, len(content), 30):
         content[place] ^= 0x10
         file.write_bytes(content)
         try:
@@ -213,6 +217,8 @@ FOREIGN = {
 def test_a_file_of_a_version_with_more_in_it_is_read_where_that_was_empty(file):
     """Friction could have memory: fits without any are as they were, and one with it is refused."""
     bits = _bits(load(file))
+    _rewrite(file, lambda header, arrays: None)
+    assert _bits(load(file)) == bits
 
     def older(header, arrays):
         header["rig"]["memory"] = False
@@ -231,10 +237,6 @@ def test_a_foreign_file_is_refused(tmp_path, make, reason):
     make(path)
     with pytest.raises(StoreError, match=rf"foreign\.npz: .*{reason}.*; give the model\.npz"):
         load(path)
-
-
-def _set(**values):
-    return lambda header, arrays: header.update(values)
 
 
 def _wrong_shape(header, arrays):
@@ -256,8 +258,11 @@ def _other_code(header, arrays):
 
 
 MISFITS = {
-    "format": (_set(format=0, version="0.0.1"), r"format 0 \(nnap_em 0\.0\.1\), this version reads format 4"),
-    "newer": (_set(format=5), "format 5"),
+    "format": (
+        lambda header, _: header.update(format=0, version="0.0.1"),
+        r"format 0 \(nnap_em 0\.0\.1\), this version reads format 4",
+    ),
+    "newer": (lambda header, _: header.update(format=5), "format 5"),
     "system": (lambda header, _: header["rig"].update(system="crane"), "'crane' is not registered"),
     "header": (lambda header, _: header.pop("notes"), "lacks something"),
     "rig": (lambda header, _: header["rig"].pop("dt"), "lacks something"),
@@ -275,23 +280,14 @@ def test_a_file_of_another_version_is_refused(file, change, reason):
         load(file)
 
 
-def test_a_rewritten_file_without_a_change_is_accepted(file):
-    bits = _bits(load(file))
-    _rewrite(file, lambda header, arrays: None)
-    assert _bits(load(file)) == bits
-
-
-def test_a_changed_number_breaks_the_checksum(file):
+def test_a_changed_number_breaks_the_checksum_and_64_bits_are_not_rounded(file):
+    with jax.enable_x64(False), pytest.raises(StoreError, match="64 bits; first call jax"):
+        load(file)
     with np.load(file) as content:
         arrays = {name: content[name] for name in content.files}
     arrays["/state/model/log_q"] = arrays["/state/model/log_q"] + 1e-9
     np.savez(file, **arrays)
     with pytest.raises(StoreError, match="checksum does not hold; use another copy"):
-        load(file)
-
-
-def test_numbers_of_64_bits_are_not_rounded_silently(file):
-    with jax.enable_x64(False), pytest.raises(StoreError, match="64 bits; first call jax"):
         load(file)
 
 

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from helpers import file_rig
 from machine_files import CASES, errors, friction, recorded
+from shell import ENVIRONMENT
 
 from nnap_em import identify
 from nnap_em.data.machine import unpacked
@@ -26,6 +27,7 @@ from nnap_em.fit.identify import Identified, begin
 from nnap_em.fit.store import load, save
 from nnap_em.machines.mjcf import read_machine
 from nnap_em.model.simulate import declared, paper_model
+from nnap_em.model.state_space import Inputs
 from nnap_em.systems import specs
 
 MACHINES = Path(machine_files.__file__).parent / "machines"
@@ -61,29 +63,30 @@ import numpy as np
 from nnap_em.fit.store import load
 fitted = load(sys.argv[1])
 x = np.asarray([0.1, 0.4, -0.3, 1.0])
-u = fitted.model.inputs(__import__("nnap_em").Dataset(np.zeros(1), np.ones((1, 1)), np.zeros((1, 1)), np.ones(1, bool)))
-print(*map(repr, np.asarray(fitted.model.transition(x, jax.tree.map(lambda a: a[0], u))).tolist()))
+from nnap_em.model.state_space import Inputs
+print(*map(repr, np.asarray(jax.jit(lambda x, u: fitted.model.transition(x, Inputs.held(u)))(x, np.ones(1))).tolist()))
 """
 
 
-def test_a_saved_model_needs_neither_the_file_nor_mujoco(tmp_path):
-    uncertain = {"pole.mass": Declared(0.2, 0.05), "pole.com.z": Declared(-0.25, 0.02)}
-    fitted = _begun(parameters=uncertain)
-    save(tmp_path / "model.npz", fitted)
-    assert load(tmp_path / "model.npz").rig == fitted.rig
+@pytest.fixture(scope="module")
+def uncertain() -> Identified:
+    return _begun(parameters={"pole.mass": Declared(0.2, 0.05), "pole.com.z": Declared(-0.25, 0.02)})
+
+
+def test_a_saved_model_needs_neither_the_file_nor_mujoco(uncertain, tmp_path):
+    save(tmp_path / "model.npz", uncertain)
+    assert load(tmp_path / "model.npz").rig == uncertain.rig
     done = subprocess.run(
-        [sys.executable, "-c", ALONE, str(tmp_path / "model.npz")], capture_output=True, text=True, cwd=tmp_path
+        [sys.executable, "-c", ALONE, str(tmp_path / "model.npz")], capture_output=True, text=True, env=ENVIRONMENT
     )
     assert done.returncode == 0, done.stderr
-    rows = _logs(fitted.rig)[0]
-    seq = jax.tree.map(lambda a: a[0], rows)._replace(u=np.ones((40, 1)))
-    u = jax.tree.map(lambda a: a[1], fitted.model.inputs(seq))
-    expected = fitted.model.transition(jnp.asarray([0.1, 0.4, -0.3, 1.0]), u)
+    step = jax.jit(lambda x, u: uncertain.model.transition(x, Inputs.held(u)))
+    expected = step(np.asarray([0.1, 0.4, -0.3, 1.0]), np.ones(1))
     np.testing.assert_array_equal([float(v) for v in done.stdout.split()], expected)
 
 
-def test_a_machine_from_a_file_is_exported(tmp_path):
-    write_model(_begun(parameters={"pole.mass": Declared(0.2, 0.05)}), tmp_path)
+def test_a_machine_from_a_file_is_exported(uncertain, tmp_path):
+    write_model(uncertain, tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["parameters.json"]
     assert '"unit": "kg"' in (tmp_path / "parameters.json").read_text()
 
@@ -110,16 +113,15 @@ def test_a_written_machine_is_the_same_in_mujoco(tmp_path, file):
     (tmp_path / "rig.toml").write_text(text)
     rig, t = read_rig(tmp_path / "rig.toml", specs), 0.01 * np.arange(30.0)
     logs = machine_files.Dataset(t[None], np.sin(t)[None, :, None], np.sin(t)[None, :, None], np.ones((1, 30), bool))
-    assert write_mjcf(begin(rig, logs, key=jax.random.key(0)), tmp_path / "out.xml") == []
-    written, rng = mujoco.MjModel.from_xml_path(str(tmp_path / "out.xml")), np.random.default_rng(0)
-    system = begin(rig, logs, key=jax.random.key(0)).model.system
-    for _ in range(3):
-        q, v = rng.uniform(-2.0, 2.0, (2, len(joints)))
-        mass, _ = _physics(written, q, v)
-        np.testing.assert_allclose(mass, system.mass(jnp.asarray(q)), rtol=1e-9, atol=1e-9)
-        still = np.zeros_like(v)
-        bias = system.bias(jnp.asarray(q), jnp.asarray(still))
-        np.testing.assert_allclose(_physics(written, q, still)[1], bias, atol=1e-8)
+    fitted = begin(rig, logs, key=jax.random.key(0))
+    assert write_mjcf(fitted, tmp_path / "out.xml") == []
+    written, system = mujoco.MjModel.from_xml_path(str(tmp_path / "out.xml")), fitted.model.system
+    states = np.random.default_rng(0).uniform(-2.0, 2.0, (3, len(joints)))
+    forces = jax.jit(lambda states: jax.lax.map(lambda q: (system.mass(q), system.bias(q, 0.0 * q)), states))
+    for q, mass, bias in zip(states, *forces(states), strict=True):
+        other, force = _physics(written, q, 0.0 * q)
+        np.testing.assert_allclose(other, mass, rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(force, bias, atol=1e-8)
     np.testing.assert_allclose(written.dof_damping, [joint.damping for joint in machine.joints])
     np.testing.assert_allclose(written.dof_frictionloss, [joint.dry for joint in machine.joints])
     again = read_machine(tmp_path / "out.xml")
@@ -183,10 +185,13 @@ def test_a_file_is_written_where_its_meshes_are_gone(tmp_path):
     assert [model.geom(i).name for i in range(model.ngeom)] == ["floor", "tube"]
 
 
-def test_a_fit_that_has_no_machine_file_is_refused(tmp_path):
-    fitted = _begun()
+def test_a_fit_that_has_no_machine_file_is_refused(uncertain, tmp_path):
     with pytest.raises(ExportError, match="before fits held their machine's file; identify again"):
-        write_mjcf(fitted._replace(rig=dataclasses.replace(fitted.rig, file="")), tmp_path / "out.xml")
+        write_mjcf(uncertain._replace(rig=_rig(file="")), tmp_path / "out.xml")
+    model = dataclasses.replace(uncertain.model, system=paper_model().system)
+    built_in = uncertain._replace(rig=declared("acrobot", paper_model()), state=uncertain.state._replace(best=model))
+    with pytest.raises(ExportError, match="'acrobot' is built in, and has no file to be written back to; "):
+        write_mjcf(built_in, tmp_path / "out.xml")
 
 
 def test_found_springs_loads_and_changed_numbers_are_written_and_the_rest_is_told(tmp_path):
@@ -204,46 +209,44 @@ def test_found_springs_loads_and_changed_numbers_are_written_and_the_rest_is_tol
     assert model.dof_armature[0] == pytest.approx(0.2)
 
 
-def test_a_breakaway_torque_is_named_and_coulomb_friction_written(tmp_path, monkeypatch):
+def test_a_breakaway_torque_is_named_and_coulomb_friction_written(uncertain, tmp_path, monkeypatch):
     forms = [FrictionForm(0.3, 0.5, 0.1, 0.2), FrictionForm(0.1, 0.1, 1.0, 0.05)]
     monkeypatch.setattr("nnap_em.export.mjcf.friction_forms", lambda _: forms)
-    assert write_mjcf(_begun(), tmp_path / "out.xml") == ["breakaway of rail: 0.5 over a Coulomb friction of 0.3"]
+    assert write_mjcf(uncertain, tmp_path / "out.xml") == ["breakaway of rail: 0.5 over a Coulomb friction of 0.3"]
     model = mujoco.MjModel.from_xml_path(str(tmp_path / "out.xml"))
     np.testing.assert_allclose([model.dof_frictionloss, model.dof_damping], [[0.3, 0.1], [0.2, 0.05]])
 
 
+V = np.linspace(-2.0, 2.0, 160)
+
+
+def _form(torque, std: float = 1e-3, v=V) -> FrictionForm:
+    return friction_form(v, torque, np.full(160, std))
+
+
 def test_coulomb_and_viscous_friction_are_read_off_a_curve():
-    v, std = np.linspace(-2.0, 2.0, 80), np.full(80, 0.01)
-    form = friction_form(v, -0.3 * np.sign(v) - 0.2 * v, std)
+    form = _form(-0.3 * np.sign(V) - 0.2 * V, 0.01)
     np.testing.assert_allclose([form.coulomb, form.viscous, form.offset, form.missed], [0.3, 0.2, 0.0, 0.0], atol=1e-6)
-    form = friction_form(v, 0.1 * v, std)
+    form = _form(0.1 * V, 0.01)
     assert (form.coulomb, form.viscous) == (0.0, 0.0) and form.missed == pytest.approx(1.0)  # friction never pushes
 
 
 def test_a_dip_and_a_constant_are_read_off_a_curve():
-    v = np.linspace(-2.0, 2.0, 160)
-    level = 0.3 + 0.2 * np.exp(-((v / 0.15) ** 2))
-    form = friction_form(v, 0.05 - level * np.tanh(v / 0.02) - 0.2 * v, np.full(160, 0.001))
+    level = 0.3 + 0.2 * np.exp(-((V / 0.15) ** 2))
+    form = _form(0.05 - level * np.tanh(V / 0.02) - 0.2 * V)
     np.testing.assert_allclose(form[:6], [0.3, 0.5, 0.15, 0.2, 0.05, 0.02], rtol=0.01)
 
 
 def test_a_dip_that_the_sign_hides_is_none():
     """Friction that rises over 2 rad/s, a little faster at first: no torque breaks away."""
-    v = np.linspace(-8.0, 8.0, 160)
-    form = friction_form(v, -(0.3 + 0.6 * np.exp(-((v / 0.5) ** 2))) * np.tanh(v / 2.0), np.full(160, 1e-3))
+    form = _form(-(0.3 + 0.6 * np.exp(-((4 * V / 0.5) ** 2))) * np.tanh(4 * V / 2.0), v=4 * V)
     assert form.breakaway == form.coulomb
-    form = friction_form(v, 0 * v, np.full(160, 1e-3))
+
+
+@pytest.mark.slow  # fast: test_a_dip_that_the_sign_hides_is_none
+def test_no_friction_has_a_form_of_zeros():
+    form = _form(0 * V, v=4 * V)
     assert (form.coulomb, form.breakaway, form.viscous, form.missed) == (0.0, 0.0, 0.0, 0.0)
-
-
-def test_a_built_in_machine_has_no_file(tmp_path):
-    rig = declared("acrobot", paper_model())
-    t = 0.01 * np.arange(30.0)
-    logs = machine_files.Dataset(
-        t[None], np.sin(t)[None, :, None], np.stack([np.sin(t), np.cos(t)], -1)[None], np.ones((1, 30), bool)
-    )
-    with pytest.raises(ExportError, match="'acrobot' is built in, and has no file to be written back to; "):
-        write_mjcf(begin(rig, logs, key=jax.random.key(0)), tmp_path / "out.xml")
 
 
 # --- identified, from logs that MuJoCo made

@@ -197,7 +197,7 @@ WRONG = {  # the change of arrays, and the place and finding
     "inputs": (lambda d: d._replace(u=np.repeat(d.u, 2, axis=-1)),
         "u has 2 columns; give those of the rig in its order: u"),
     "readings": (lambda d: d._replace(y=d.y[..., :0]),
-        "y has 0 columns; give those of the rig in its order: theta1, dth"),
+        "y has 0 columns; give those of the rig in its order: theta1, dtheta1"),
     "dt": (lambda d: d._replace(t=2 * d.t), "sequence 0, row 1: t goes from 0 to 0.02 s, the rig has dt = 0.01 s"),
     "ms": (lambda d: d._replace(t=1e3 * d.t), "sequence 0, row 1: t goes from 0 to 10 s"),
     "a late row": (lambda d: d._replace(t=d.t + 0.004 * (np.arange(5) == 3)),

@@ -34,7 +34,7 @@ from nnap_em.systems.pseudo_inertia import Numbers, of_pseudo, pseudo, stepped
 
 ROOT = Path(__file__).resolve().parents[1]
 OWN = sorted((ROOT / "tests" / "machines").iterdir())
-ARMS = 3, 6
+ARMS = 1, 5
 
 
 def _arm(folder: Path, joints: int = 3) -> Path:

@@ -184,11 +184,11 @@ class _Posterior(NamedTuple):
 
             def slopes(z, own=own, laws=laws):
                 step = 1.5e-8 * np.maximum(np.abs(z), 1.0)
-                at, *beside = own.residual(laws(np.vstack([z, z + np.diag(step)])))
-                return ((beside - at) / step[:, None]).T
+                off = own.residual(laws(np.vstack([z, z + np.diag(step)])))
+                return ((off[1:] - off[0]) / step[:, None]).T
 
             with np.errstate(over="ignore"):  # a step too far: the next one is shorter
-                fit = least_squares(residual, full[free], slopes, method="lm", xtol=1e-8)
+                fit = least_squares(residual, full[free], slopes, method="lm", xtol=1e-8)  # type: ignore[arg-type]
             fits.append((float(fit.cost), laws(fit.x[None])[0]))
         return sorted(fits, key=lambda fit: fit[0])
 

@@ -243,7 +243,6 @@ def test_a_dip_that_the_sign_hides_is_none():
     assert form.breakaway == form.coulomb
 
 
-@pytest.mark.slow  # fast: test_a_dip_that_the_sign_hides_is_none
 def test_no_friction_has_a_form_of_zeros():
     form = _form(0 * V, v=4 * V)
     assert (form.coulomb, form.breakaway, form.viscous, form.missed) == (0.0, 0.0, 0.0, 0.0)

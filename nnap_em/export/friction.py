@@ -49,6 +49,8 @@ def friction_form(
     A dip or a constant is kept only where it explains more than 0.005 of the curve, and more than a part of its
     uncertainty; a dip narrower than the sign is none, as its breakaway torque is never reached.
     """
+    if not np.any(torque):
+        return FrictionForm(fastest=float(np.max(np.abs(v))))
     weight = 1 / np.maximum(std, 0.05 * np.max(np.abs(torque), initial=1e-300))
     fits = {kind: _form(v, torque, weight, *kind) for kind in itertools.product((False, True), repeat=2)}
     fits = {kind: form for kind, form in fits.items() if not kind[1] or form.stribeck > form.smooth}

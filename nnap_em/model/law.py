@@ -114,7 +114,7 @@ def curve(value: Float[np.ndarray, "param ..."], v: Float[np.ndarray, " node"]) 
     """Torque of the law over velocity [N m], the constant included; of several laws with axes (param, law, 1)."""
     coulomb, breakaway, stribeck, viscous, smooth, offset = value
     level = coulomb + (breakaway - coulomb) * np.exp(-((v / stribeck) ** 2))
-    return offset - level * np.tanh(v / smooth) - viscous * v
+    return offset - level * np.tanh(v / np.maximum(smooth, 1e-150)) - viscous * v  # 0: narrower than any number
 
 
 def nearest(

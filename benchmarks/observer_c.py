@@ -114,7 +114,10 @@ def compiled(source: Path, program: str, out: str, *options: str) -> Path:
 def play(
     source: Path, t: np.ndarray, u: np.ndarray, y: np.ndarray, states: int, kind: type = np.float64, *options: str
 ) -> Played:
-    """A log through a written observer; `u` are the inputs held from the row before, `options` those of gcc."""
+    """A log through a written observer; `u` are the inputs held from the row before, `options` those of gcc.
+
+    Compiled anew only where the observer was written since.
+    """
     out = "".join([source.stem, *options, ".so"])
     path = source.with_name(out)
     if not path.exists() or path.stat().st_mtime_ns < source.stat().st_mtime_ns:

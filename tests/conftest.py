@@ -84,7 +84,7 @@ def bench():
 
 @pytest.fixture(scope="session")
 def slide_fit():
-    """A fit of the slide of `rigs.py`."""
+    """A fit of `slide_rig()` to `slide_logs(0)`."""
     from rigs import slide_logs, slide_rig
 
     from nnap_em.fit.identify import identify

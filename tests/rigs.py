@@ -27,7 +27,7 @@ def slide_logs(
     frictionless: bool = False,
     laws: tuple[AbstractEffect, ...] = (),
 ) -> Dataset:
-    """Its logs; its Coulomb friction of 1 N has grown by `more` [N]."""
+    """Logs of that slide, swept; its dry friction has grown by `more` [N], or it has none, and `laws` act beside it."""
     truth, sweep = examples["slide"]()
     law = truth.unknown
     if frictionless:

@@ -24,6 +24,7 @@ from nnap_em.fit.store import load, save
 GROWN = 0.2
 """Growth of the Coulomb friction of a slide [N]; it is 1."""
 LONG = {"steps": 200}
+"""Recordings in which the change is found with its size: 95 steps are too few."""
 
 
 # --- the posterior of a fit as a prior
@@ -63,7 +64,7 @@ def test_rigs_that_differ_are_named_key_by_key():
 
 @pytest.fixture(scope="module")
 def closed():
-    """Longer recordings, which leave less room for the change."""
+    """A search in recordings of a slide whose friction has grown by `GROWN` since its fit."""
     before = identify(slide_rig(), slide_logs(0, **LONG), key=jax.random.key(0))
     new, old = slide_logs(1, GROWN, **LONG), slide_logs(0, **LONG)
     return diagnose(slide_rig(), new, key=jax.random.key(0), start=before, own=old)
@@ -84,9 +85,8 @@ def test_friction_that_grew_is_named_with_its_size(closed, tmp_path):
 @pytest.mark.slow  # fast: test_a_machine_that_did_not_change_is_said_to_be_the_same
 def test_nothing_changed_since_a_fit_that_has_a_law(closed):
     """The law of the fit is no finding, and stays."""
-    again = diagnose(
-        slide_rig(), slide_logs(3, GROWN), key=jax.random.key(0), start=closed.after, own=slide_logs(1, GROWN)
-    )
+    new, own = slide_logs(3, GROWN, **LONG), slide_logs(1, GROWN, **LONG)
+    again = diagnose(slide_rig(), new, key=jax.random.key(0), start=closed.after, own=own)
     assert not findings(again) and changes(again, []).startswith("Nothing changed since the fit")
     assert [effect.name for effect in again.after.model.effects] == ["coulomb_change"]
 

@@ -136,12 +136,12 @@ def test_a_sum_of_states_read_exactly_determines_neither(size):
 
 
 def test_a_place_that_nothing_tells_is_named():
-    """A slide knows no place: its rate tells nothing of it, and friction does not mind."""
+    """The rate of a slide does not depend on its position, so that the position is not determined."""
     turn = np.broadcast_to([[1.0, 0.01], [0.0, 1.0]], (1, 101, 2, 2))
     along = Along(
         np.random.default_rng(0).normal(size=(1, 101, 2)), turn, np.broadcast_to([[0.0, 1.0]], (1, 101, 1, 2))
     )
-    model = replace(slide_model()[0], dt=0.01, measured=(1,), log_r=jnp.log(jnp.full(1, 2.5e-5)))
+    model = replace(slide_model()[0], dt=0.01, measured=(1,), log_r=2 * jnp.log(jnp.full(1, 5e-3)))
     (finding,) = observability(model, along, np.ones((1, 101), bool))
     assert finding.mark == "warning"
     assert "1 of 2 directions" in finding.text and "not determined: x" in finding.text
@@ -254,7 +254,8 @@ def test_the_command_prints_a_line_per_question_and_fails_where_one_is_bad(tmp_p
     assert nnap("check", folder) == 1
     bad = capsys.readouterr()
     assert "nnap-em: 2 errors" in bad.err
-    assert re.search(r"(?m)^error    dynamics    u is in another unit: multiply it by 9.91e\+05 ", bad.out)
+    found = re.search(r"(?m)^error    dynamics    u is in another unit: multiply it by (\S+) ", bad.out)
+    assert found and float(found[1]) == pytest.approx(1e6, rel=0.02)  # derivatives of noisy positions: 1 % here
     assert re.search(r"(?m)^error    torque      u: up to .* look at its unit", bad.out)
     assert sorted(tmp_path.rglob("*")) == before
 

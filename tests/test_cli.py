@@ -355,7 +355,7 @@ def test_a_stop_before_the_first_epoch_keeps_nothing(bench, tmp_path, monkeypatc
 
 
 def test_without_test_sequences_there_is_no_error_to_report(bench, fit, tmp_path, monkeypatch, capsys):
-    """A fit is given the training sequences alone."""
+    """A fit is given the training sequences alone, where there are others and where there are none."""
     shutil.copytree(bench, tmp_path / "bench")
     shutil.rmtree(tmp_path / "bench/test")
     fitted = load(fit / "model.npz")
@@ -368,10 +368,12 @@ def test_without_test_sequences_there_is_no_error_to_report(bench, fit, tmp_path
         return fitted
 
     monkeypatch.setattr(identify_command, "identify", identify)
-    assert nnap("identify", tmp_path / "bench", "--out", tmp_path / "out", "--epochs", 1) == 0
-    report = json.loads((tmp_path / "out/report.json").read_text())
+    for folder, out in ((bench, "a"), (tmp_path / "bench", "b")):
+        assert nnap("identify", folder, "--out", tmp_path / out, "--epochs", 1) == 0
+        said = capsys.readouterr().err
+    report = json.loads((tmp_path / "b/report.json").read_text())
     assert report["fit"] is report["error"] is None
-    assert "no test sequences" in report["error_note"] and "no test sequences" in capsys.readouterr().err
+    assert "no test sequences" in report["error_note"] and "no test sequences" in said
 
 
 def test_json_has_null_for_what_is_no_number():

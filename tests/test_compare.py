@@ -71,7 +71,7 @@ def changed(fits) -> Comparison:
 
 
 @pytest.mark.slow  # fast: tests of one comparison, here
-def test_nothing_changed_between_two_halves_of_a_data_set(unchanged):
+def test_nothing_changed_between_two_sets_of_recordings_of_a_slide(unchanged):
     assert unchanged.names == ("first", "second")
     assert unchanged.changed == unchanged.warnings == ()
     assert unchanged.verdict == (

@@ -128,7 +128,7 @@ def test_what_was_written_is_read(tmp_path, write, name, columns):
 
 
 def test_lists_and_episodes_are_sequences(tmp_path):
-    """Of LeRobot, whose numbers are in single precision, and of a table without times."""
+    """Lists of LeRobot come in single precision; a table of episodes may lack times."""
     for fixed in (False, True):
         log = dialects.lerobot(tmp_path / f"set {fixed}", fixed=fixed)
         _close(_imported(log, _rig(tmp_path, LISTS)), 100, 1e-6, 2)

@@ -128,7 +128,7 @@ AT_ONCE = {name: ("acrobot", name, CASES[name][0]) for name in MAKE if name not 
 }  # fmt: skip
 """Laws of the moment, compared at states: system, name and numbers."""
 CRUDE = {"hard_stop": 1e-3}
-"""Of what is not the same to rounding: the damper of a stop sets in over a hundredth of a radian."""
+"""Relative tolerance of laws whose two forms differ: the damper of our stop sets in over a hundredth of a radian."""
 NOT_COMPARED = {
     "sensor_quantization": "as noise it moves no mean",
     "unknown_function": "it has no form; its parts are tested below",

@@ -93,7 +93,7 @@ def test_what_needs_joints_refuses_with_one_sentence_and_writes_nothing(place, c
     assert sorted(place.rglob("*")) == before
 
 
-@pytest.mark.slow  # fast: test_the_table_of_an_unknown_term_has_its_values_and_their_spread
+@pytest.mark.slow  # fast: test_a_declared_unknown_term_is_part_of_the_model
 def test_identify_reports_its_unknown_terms(place, monkeypatch):
     monkeypatch.chdir(place)
     shutil.copytree(place / "monday_logs", place / "unknown_logs")

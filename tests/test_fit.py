@@ -215,7 +215,7 @@ FINISHED = {  # errors at 0.25, 0.5 and 1 s of a parameter z whose step is alway
 
 @pytest.mark.parametrize(("size", "end"), FINISHED.values(), ids=FINISHED)
 def test_a_gauss_newton_step(monkeypatch, size, end):
-    """Of which nothing more is taken than what makes the errors fall."""
+    """A step is halved until the errors fall, and left where they do not."""
 
     def errors(along, horizons):
         scale = size(float(RULE.prior.read(along.model)[0]))[: len(horizons)]

@@ -98,9 +98,7 @@ def test_a_function_of_the_second_input_is_found_at_its_joint(plain):
     seed = next(c for c in _functions(plain[-1]) if c.start.inputs_named() == ("tau2",))
     bump = jnp.zeros(20).at[13:17].set(0.1)
     asked = _asked((UnknownFunction(bump, seed.start.axes, joint=2),))
-    signals = ("tau1",), ("tau2",), ("theta2",)
-    candidates = [c for c in _functions(asked[-1]) if c.start.inputs_named() in signals]
-    assert {c.start.joint for c in candidates} == {1, 2}
+    candidates = _functions(asked[-1])
     best = candidates[int(np.argmax([v.share.inside for v in _screened(asked, candidates)]))].start
     assert (best.joint, best.inputs_named()) == (2, ("tau2",))
 
@@ -129,7 +127,7 @@ def test_an_input_that_never_moves_is_no_signal():
     candidates = proposals(asked[-1])
     assert not any("tau2" in c.start.inputs_named() for c in candidates)
     assert all(np.isfinite(np.asarray(leaf)).all() for c in candidates for leaf in jax.tree.leaves(c))
-    some = [next(c for c in candidates if c.start.inputs_named() == ("tau1",))]
+    some = [c for c in candidates if c.start.inputs_named() == ("tau1",) or c.start.name == "torsional_spring"]
     assert all(np.isfinite(v.share.inside) for v in _screened(asked, some))
 
 

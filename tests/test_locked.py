@@ -130,7 +130,8 @@ def test_mass_and_bias_are_those_of_the_whole_with_joints_held(machine, line, he
     v[:, free] = rng.uniform(-3.0, 3.0, (5, len(free)))
     forces = lambda row: (system.mass(row[0]), system.bias(*row))  # noqa: E731
     masses, biases = jax.jit(lambda rows: jax.lax.map(forces, rows))((jnp.asarray(q[:, free]), jnp.asarray(v[:, free])))
-    for k, data in enumerate([mujoco.MjData(model)] * 5):
+    data = mujoco.MjData(model)
+    for k in range(5):
         data.qpos[:], data.qvel[:] = q[k], v[k]
         mujoco.mj_forward(model, data)
         mass = np.zeros((model.nv, model.nv))

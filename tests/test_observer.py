@@ -16,6 +16,7 @@ from nnap_em.fit.identify import begin
 from nnap_em.fit.observer import AMBIGUOUS, MISSING, NO_INPUT, OUTLIER, RESTARTED, functions, observer, restart_prior
 from nnap_em.model import hooks
 from nnap_em.model.base import prepare
+from nnap_em.model.friction import FrictionNetwork
 from nnap_em.model.servo import Servo
 from nnap_em.model.simulate import paper_experiment, paper_model
 from nnap_em.model.state_space import with_effects
@@ -75,13 +76,15 @@ LAWS = {
         (catalogue["presliding_friction"].of(0.0, 0.1, 0.0, 0.5, 0.5, 20.0, joint=1),),
         (Servo("goal", "position", {"kp": NUMBER(8.0)}, (("kp", 0, 0.2),)),),
     ),
+    "learned friction": ((), None, FrictionNetwork(NUMBER([2.0]), NUMBER([0.3]), key=jax.random.key(0))),
 }  # fmt: skip
 
 
 @pytest.mark.parametrize("laws", LAWS)
 def test_the_same_numbers_as_the_filter(laws):
-    """By cubature where inputs are held, by the tangent where they are smooth."""
-    held = _model(*LAWS[laws])
+    """The observer gives the numbers of the filter: by cubature with held inputs, by the tangent with smooth ones."""
+    effects, servos, *friction = LAWS[laws]
+    held = _model(effects, servos, **dict(zip(("unknown",), friction, strict=False)))
     data = _log(held, rows=60, columns=2 if laws.startswith("a gain from a column") else 1)
 
     @jax.jit
@@ -153,7 +156,7 @@ def acrobot():
 
 
 def test_branches_are_those_of_the_mixture(acrobot, monkeypatch):
-    """As long as none is so unlikely that the observer ends it; of two sequences at a time each is as by itself."""
+    """Without pruning, the best branch is that of the mixture filter, also where two sequences are batched."""
     model, experiment, _ = acrobot
     every = jax.tree.map(lambda a: a[:, :100], experiment.data)
     data = jax.tree.map(lambda a: a[0], every)

@@ -140,10 +140,10 @@ def test_branches_in_c_are_those_of_python(acrobot):
 def test_wild_input_leaves_numbers_and_no_fault(which, single, request, tmp_path):
     """NaN, infinity, huge values, jumps, starts: under the address and undefined behaviour sanitizers.
 
-    Some faults take thousands of steps to meet, as branches of which one is impossible.
+    Some faults take longer than a tenth of these steps to meet, as branches of which one is impossible.
     """
     write_observer(request.getfixturevalue(which)[0], tmp_path / "wild.c", single=single)
-    assert all(wild(tmp_path / "wild.c", 10_000, *SANITIZED, "-O1")[k] > 0 for k in (0, 2, 3))
+    assert all(wild(tmp_path / "wild.c", 30_000, *SANITIZED, "-O1")[k] > 0 for k in (0, 2, 3))
 
 
 def test_stamps_say_which_rows_are_missing(plain):

@@ -88,7 +88,7 @@ def _parsed(html):
 
 
 def _text(document, *pictures) -> str:
-    """What a reader of its page sees."""
+    """The words of the page of a document, without tags."""
     return " ".join("".join(_parsed(page(document, *pictures)).text).split())
 
 

@@ -200,7 +200,7 @@ def _after_the_first_step(run: subprocess.Popen, out: Path) -> None:
         time.sleep(0.1)
 
 
-@pytest.mark.slow  # fast: test_groups_change_nothing
+@pytest.mark.slow  # fast: test_a_chain_of_all_faults_is_survived
 def test_ctrl_c_says_how_to_go_on(rig, toy, tmp_path):
     out = tmp_path / "out"
     with _launched(2, "identify", rig, "--out", out, start_new_session=True, **toy) as run:
@@ -211,7 +211,7 @@ def test_ctrl_c_says_how_to_go_on(rig, toy, tmp_path):
     assert "to go on: nnap-em identify" in said and "--resume" in said
 
 
-@pytest.mark.slow  # fast: test_groups_change_nothing
+@pytest.mark.slow  # fast: test_a_chain_of_all_faults_is_survived
 def test_a_dying_process_ends_the_run_and_leaves_the_finished_steps(rig, toy, tmp_path, monkeypatch, capsys):
     out = tmp_path / "out"
     with _launched(2, "identify", rig, "--out", out, **toy) as run:

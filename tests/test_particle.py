@@ -259,9 +259,6 @@ def test_weights_of_the_blind_filter_by_hand():
     assert float(h.loglik) == pytest.approx(total, rel=1e-9)
 
 
-slow = pytest.mark.slow  # fast: test_a_machine_agrees_with_the_kalman_smoother
-
-
 class _Escape(_Oscillator):
     """A walk whose drift doubles back near 0 and runs away beyond 1: x + x^3 dt."""
 
@@ -309,7 +306,10 @@ def _density_on_a_grid(start):
     return loglik
 
 
-@pytest.mark.parametrize("dtype", (jnp.float32, pytest.param(jnp.float64, marks=slow)), ids=["single", "double"])
+# fast: the same in single precision
+@pytest.mark.parametrize(
+    "dtype", (jnp.float32, pytest.param(jnp.float64, marks=pytest.mark.slow)), ids=["single", "double"]
+)
 def test_a_particle_that_runs_away_leaves_the_others_alone(dtype):
     history, paths = _escaped(jnp.asarray(0.0), dtype)
     assert np.any(np.isneginf(history.log_w))  # there are some
@@ -324,11 +324,12 @@ def test_a_particle_that_runs_away_leaves_the_others_alone(dtype):
     assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves((paths, history.ess)))
 
 
-@pytest.mark.parametrize("name", ["pendulum", pytest.param("acrobot", marks=slow)])
+# fast: the same of a pendulum
+@pytest.mark.parametrize("name", ["pendulum", pytest.param("acrobot", marks=pytest.mark.slow)])
 def test_a_machine_agrees_with_the_kalman_smoother(name):
-    """Of which not all is read, and that not always; a kick is the process noise of a path."""
+    """Part of the state is read, in some of the rows; the kick of a path is its process noise."""
     model, sweep = examples[name]()
-    std = jnp.asarray([0.9, 0.05, 0.02, 0.02][: len(model.log_q)])
+    std = jnp.asarray([0.9, 0.05, 0.02, 0.02][: len(model.log_q)])  # of the first row, small beside the motion
     model = eqx.tree_at(lambda m: m.start.cov, model, jnp.diag(std**2))
     seq = jax.tree.map(lambda a: a[0], sweep_experiment(model, sweep, 1, 80, key=jax.random.key(4)).data)
     seq = seq._replace(y=seq.y.at[30:40].set(jnp.nan).at[60, -1].set(jnp.nan))
@@ -388,6 +389,7 @@ def _noise(dtype=jnp.float32):
     return np.asarray(jax.jit(jax.vmap(draw, in_axes=(0, None)))(keys, jnp.arange(10)))
 
 
+# fast: the same in single precision
 @pytest.mark.parametrize("dtype", (jnp.float32, jnp.float64), ids=["single", "double"])
 def test_normals_are_normal(dtype):
     assert _noise(dtype).dtype == dtype

@@ -1,4 +1,6 @@
-"""The truth of our benchmarks beside what test_effects.py compares: forms that the catalogue lacks, files, oracle."""
+"""The simulator of the benchmarks where test_effects.py does not compare it: forms that the catalogue lacks, files, the
+oracle.
+"""
 
 import json
 
@@ -102,10 +104,27 @@ def test_a_delay_of_half_a_sample_switches_in_the_middle():
         np.testing.assert_allclose(plant._runge_kutta(p, half, u[:, k - 1], t, 0.005), x[:, k + 1], atol=1e-12)
 
 
+def test_a_sensor_late_by_half_a_sample_reads_between_two_rows():
+    """Linear between them: off by at most a quarter of the squared time times the largest acceleration."""
+    late = ({"name": "sensor_delay", "channel": "all", "delay": 1.5 * plant.DT},)
+    case = SMALL._replace(effects=late)
+    x = _run(case)
+    read = plant.noise_free(plant.build(case), x)[:, 2:, 0]
+    np.testing.assert_allclose(read, 0.5 * (x[:, 1:-1, 0] + x[:, :-2, 0]), atol=4e-3)
+
+
+def test_a_coarse_encoder_reads_multiples_of_its_step():
+    effect = plant.STRONG["sensor_quantization"][0]
+    case = SMALL._replace(effects=(effect,))
+    y = plant.readings(plant.build(case), _run(case))[..., 0]
+    np.testing.assert_allclose(y / effect["step"], np.round(y / effect["step"]), atol=1e-9)
+
+
 @pytest.mark.parametrize("name", ["backlash", "presliding_friction", "hard_stop", "joint_flexibility"])
 def test_stiff_effects_are_integrated_finely_enough(name):
-    case = SMALL._replace(effects=plant.STRONG[name], sequences=1, tests=1, steps=20)
-    np.testing.assert_allclose(_run(case)[:, -1, :2], _run(case, substeps=60)[:, -1, :2], atol=2e-3)
+    """With one substep they are off by 6e-3 and more."""
+    case = SMALL._replace(effects=plant.STRONG[name])
+    np.testing.assert_allclose(_run(case)[..., :2], _run(case, substeps=60)[..., :2], atol=2e-3)
 
 
 def test_the_play_of_a_backlash_is_free():

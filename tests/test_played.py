@@ -153,20 +153,16 @@ def test_a_limit_before_a_law_without_an_element_has_none_either(bare, tmp_path)
 
 @pytest.mark.skipif(shutil.which("gcc") is None, reason="needs gcc")
 def test_compiled_c_gives_the_torques_of_the_library(bare, tmp_path):
-    """And with the torque of the feed-forward the machine has the acceleration that was asked for."""
-    position, smooth = (
-        c["position_dependent_friction"].of(0.3, 0.2, 2.0, joint=2),
-        ("cogging", "load_friction", "unknown_function"),
-    )
+    """Compiled C gives the torques of feed-forward and friction, and the machine then accelerates as asked."""
+    position = c["position_dependent_friction"].of(0.3, 0.2, 2.0, joint=2)
+    smooth = "cogging", "load_friction", "unknown_function"
     fitted = _with(bare[0], STATIC["payload"], position, *(UNPLACED[n] for n in (*smooth, "dead_zone")))
     assert write_c(fitted, tmp_path / "arm.c") == ["dead_zone at joint 1"]
     flags = ["-std=c99", "-pedantic", "-Wall", "-Wextra", "-Werror", "-shared", "-fPIC", "arm.c", "-o", "arm.so", "-lm"]
     subprocess.run(["gcc", *flags], cwd=tmp_path, check=True)
     compiled, (_, feedforward, _) = ctypes.CDLL(str(tmp_path / "arm.so")), torques(fitted)
-    states, array = (
-        np.random.default_rng(0).normal(size=(20, 3, 2)),
-        lambda values: (ctypes.c_double * len(values))(*values),
-    )
+    states = np.random.default_rng(0).normal(size=(20, 3, 2))
+    array = lambda values: (ctypes.c_double * len(values))(*values)  # noqa: E731
     driven = _with(bare[0], STATIC["payload"], UNPLACED["cogging"], UNPLACED["eddy_brake"])
 
     def one(q, v, wanted):

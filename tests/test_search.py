@@ -226,7 +226,7 @@ def _case(law, removed: float = 0.5) -> Trial:
 
 
 def _rounds(monkeypatch, *queue):
-    """Rounds that accept these laws in turn, then none; a number: so many candidates are left, as the time is up."""
+    """Replace screening rounds by a queue: a law is accepted, a number of candidates is left as the time is up."""
     left = list(queue)
 
     def screening_round(fit, context):

@@ -226,7 +226,7 @@ BAD = {
     ),
     "its component": ("hand_velocity.x", "is of a sensor of type velocimeter; read are joints, and"),
     "a place of a body": ("link.x", "is of a sensor of type framepos of no site, or in no frame of the world"),
-    "no such site": ("wrist", "wrist"),
+    "no such site": ("wrist", "unrecognized name 'wrist'"),
 }  # fmt: skip
 
 
@@ -277,7 +277,7 @@ def swung(tmp_path_factory):
     return fitted._replace(state=fitted.state._replace(model=model, best=model, hessian=hessian)), data
 
 
-@pytest.mark.slow  # fast: test_sensors_are_shown_exported_stored_and_written_back
+@pytest.mark.slow  # fast: test_what_accelerometers_feel_of_friction_and_mass_counts_in_score_and_information
 def test_a_joint_that_only_its_sensors_tell_is_followed_and_predicted(swung):
     fitted, data = swung
     prediction = predict(fitted, data, 0.5, key=jax.random.key(0), samples=20)

@@ -58,7 +58,7 @@ def work() -> _Work:
 
 
 def _done(work: _Work, monkeypatch) -> Affine:
-    """As the next process would do it."""
+    """The outcome of `_linearised` with no program left in memory, as in the next process."""
     monkeypatch.setattr(traced._Programs, "ready", {})
     parallel._program.cache_clear()
     return parallel.each(_linearised, work[:2], work[2:])

@@ -10,8 +10,8 @@ from nnap_em.numerics.digits import share_of
 FALLS = (0.3, 0.3, 0.3, 0.3)
 
 
-def test_bounds():
-    """Their evidence is in the benchmarks."""
+def test_numbers_that_decide_are_those_that_the_benchmarks_chose():
+    """One that changes here changes verdicts; the pages of benchmarks/ have its evidence."""
     assert (verdict.MULTI_STEP, verdict.NAMED, verdict.EQUIVALENT, verdict.SUSPECT, verdict.CHANCE, verdict.AGREE) == (
         0.15,
         0.6,

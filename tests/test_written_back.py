@@ -77,7 +77,7 @@ def test_a_saved_model_needs_neither_the_file_nor_mujoco(uncertain, tmp_path):
     save(tmp_path / "model.npz", uncertain)
     assert load(tmp_path / "model.npz").rig == uncertain.rig
     done = subprocess.run(
-        [sys.executable, "-c", ALONE, str(tmp_path / "model.npz")], capture_output=True, text=True, env=ENVIRONMENT
+        [sys.executable, "-c", ALONE, "model.npz"], capture_output=True, text=True, env=ENVIRONMENT, cwd=tmp_path
     )
     assert done.returncode == 0, done.stderr
     step = jax.jit(lambda x, u: uncertain.model.transition(x, Inputs.held(u)))

@@ -168,29 +168,32 @@ class _Posterior(NamedTuple):
         self, dip: bool = True, constant: bool = True, *, at_start: bool = False
     ) -> list[tuple[float, Float[np.ndarray, " param"]]]:
         """Cost and place of minima from several starts, the best first; `at_start`: about which the prior is."""
-        free, fits = np.array([True, dip, dip, True, True, constant]), []
+        free, fits, no_dip = np.array([True, dip, dip, True, True, constant]), [], -200.0  # its logarithm
         for knee, sharpness in itertools.product(np.log([0.02, 0.1, 0.4]) if dip else [0.0], np.log([0.02, 0.1, 0.4])):
-            no_dip = -200.0  # its logarithm
-            full = np.array([np.log(0.3), np.log(0.3) if dip else no_dip, knee, np.log(0.3), sharpness - 1.5, 0.0])
-            own = self._replace(middle=full) if at_start else self
-
-            def laws(z, full=full):
-                out = np.tile(full, (len(z), 1))
-                out[:, free] = z
-                return out
-
-            def residual(z, own=own, laws=laws):
-                return own.residual(laws(z[None]))[0]
-
-            def slopes(z, own=own, laws=laws):
-                step = 1.5e-8 * np.maximum(np.abs(z), 1.0)
-                off = own.residual(laws(np.vstack([z, z + np.diag(step)])))
-                return ((off[1:] - off[0]) / step[:, None]).T
-
-            with np.errstate(over="ignore"):  # a step too far: the next one is shorter
-                fit = least_squares(residual, full[free], slopes, method="lm", xtol=1e-8)  # type: ignore[arg-type]
-            fits.append((float(fit.cost), laws(fit.x[None])[0]))
+            start = np.array([np.log(0.3), np.log(0.3) if dip else no_dip, knee, np.log(0.3), sharpness - 1.5, 0.0])
+            fits.append((self._replace(middle=start) if at_start else self)._mode(start, free))
         return sorted(fits, key=lambda fit: fit[0])
+
+    def _mode(
+        self, start: Float[np.ndarray, " param"], free: Bool[np.ndarray, " param"]
+    ) -> tuple[float, Float[np.ndarray, " param"]]:
+        """Cost and place of the minimum that is reached from a start where some numbers are `free`."""
+
+        def laws(z):
+            out = np.tile(start, (len(z), 1))
+            out[:, free] = z
+            return out
+
+        def slopes(z):
+            """Forward differences of all numbers in one call, over the root of the precision as SciPy takes them."""
+            step = np.sqrt(np.finfo(float).eps) * np.maximum(np.abs(z), 1.0)
+            off = self.residual(laws(np.vstack([z, z + np.diag(step)])))
+            return ((off[1:] - off[0]) / step[:, None]).T
+
+        with np.errstate(over="ignore"):  # a step too far: the next one is shorter
+            residual = lambda z: self.residual(laws(z[None]))[0]  # noqa: E731
+            fit = least_squares(residual, start[free], slopes, method="lm", xtol=1e-8)  # type: ignore[arg-type]
+        return float(fit.cost), laws(fit.x[None])[0]
 
 
 def _sizes(v: Float[np.ndarray, " node"], torque: Float[np.ndarray, " node"]) -> Float[np.ndarray, " param"]:

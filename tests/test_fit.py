@@ -191,7 +191,7 @@ def test_a_refit_goes_back_a_third_of_the_way_and_keeps_the_best(monkeypatch):
         strides.append(float(rule.max_log_step))
         return core._replace(log_q=core.log_q + 3.0), jnp.asarray(tried[-1]), None
 
-    monkeypatch.setattr(refits, "locals_along", lambda *_: None)
+    monkeypatch.setattr(refits, "locals_along", lambda *_: SimpleNamespace(filtered_from=None))
     monkeypatch.setattr(refits, "each", smoothed)
     monkeypatch.setattr(ScoringMStep, "advance", advance)
     trial = refits.refit(MODEL, RULE, PATH, DATA, np.array([True, True, False]), passes=5)

@@ -43,11 +43,11 @@ class Refit(NamedTuple):
 
 def _smoothed(common, one) -> tuple[Posterior, Float[Array, "time node obs"], Gaussian]:
     """Smoothed about the linearisation, the readings at its nodes, and a path that stays where nothing is known."""
-    (log_q, log_r, start), (linear, path) = common, one
-    filtered = kalman_filter(log_q, log_r, start, linear.affine, linear.reading, linear.seq)
+    (affine, reading, seq), path = one
+    filtered = kalman_filter(*common, affine, reading, seq)
     posterior = linear_posterior(filtered, rts(filtered))
     nodes = jnp.concatenate([posterior.prev, posterior.next[-1:]])
-    read = jnp.einsum("tos,tns->tno", linear.reading.rows, nodes) + linear.reading.offset[:, None]
+    read = jnp.einsum("tos,tns->tno", reading.rows, nodes) + reading.offset[:, None]
     known = jnp.isfinite(posterior.loglik) & jnp.all(jnp.isfinite(posterior.state.mean))
     return posterior, read, jax.tree.map(lambda new, old: jnp.where(known, new, old), posterior.state, path)
 
@@ -74,7 +74,8 @@ def refit(
 
     def program(rule: ScoringMStep, core: Core, path: Gaussian):
         linear = locals_along(rule.whole(model, core), rule.prior, path, data, CUBATURE)
-        posterior, read, steady = each(_smoothed, (core.log_q, core.log_r, core.start), (linear, path))
+        common = core.log_q, core.log_r, core.start
+        posterior, read, steady = each(_smoothed, common, (linear.filtered_from, path))
         following, hessian, _ = rule.advance(core, linear, posterior, read, used)
         return following, steady, posterior.loglik, hessian
 

@@ -47,12 +47,14 @@ def _sensitivities(
     def row(state, u, by_z):
         x = state.mean
 
-        def both(z, u):
+        def both(z, u, x):
             changed = prior.write(model, value.at[free].set(z[ports:]))
             return changed.transition(x, u, z[:ports]), changed.emission(x, u, z[:ports])
 
-        def along(dz, du):
-            (ahead, _), tangents = jax.jvp(both, (z, u), (dz, du))
+        def along(one):  # in a loop: six joints are compiled in 16 s in place of 20 to 25 side by side, and run as fast
+            dz, du = one
+            dx = (x - x) * dz[0]  # nothing, but batched as what follows: loops are traced once
+            (ahead, _), tangents = jax.jvp(both, (z, u, x), (dz, du, dx))
             return ahead, tangents
 
         def pushed(p):
@@ -62,7 +64,9 @@ def _sensitivities(
             return sum((e.force(scene, nothing) for e in changed.effects if e.held), still)
 
         unit = jnp.eye(z.shape[0], dtype=z.dtype)
-        ahead, (moved, read) = jax.vmap(along, in_axes=(0, -1), out_axes=(None, -1))(unit, by_z)
+        turned = jax.tree.map(lambda a: jnp.moveaxis(a, -1, 0), by_z)
+        ahead, (moved, read) = jax.lax.map(along, (unit, turned))
+        ahead, moved, read = ahead[0], moved.T, read.T
         by_force, feels = moved[:, :ports], read[:, :ports] if model.system.senses_push else None
         by_parameter = jnp.zeros((x.shape[0], value.shape[0]), x.dtype).at[:, free].set(moved[:, ports:])
         of_reading = jnp.zeros((read.shape[0], value.shape[0]), x.dtype).at[:, free].set(read[:, ports:])

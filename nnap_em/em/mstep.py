@@ -112,9 +112,8 @@ def _quadratic(common, one) -> Quadratic:
     return quadratic(log_q, log_r, start, linear, nodes, posterior, read)
 
 
-def _loglik(common, linear: Local) -> Float[Array, ""]:
-    log_q, log_r, start = common
-    return kalman_filter(log_q, log_r, start, linear.affine, linear.reading, linear.seq).loglik
+def _loglik(common, one) -> Float[Array, ""]:
+    return kalman_filter(*common, *one).loglik
 
 
 def _widened(prior: ParameterPrior, w, linear: Local, path: Gaussian, pad: int):
@@ -256,7 +255,7 @@ class ScoringMStep(AbstractMStep):
     def loglik(self, model, path: Gaussian, data: Dataset) -> Float[Array, " seq"]:
         """Log-likelihood of the readings by a model linearised about a path of every sequence, as in a step."""
         linear = locals_along(model, self.prior, path, data, self.linearise)
-        return each(_loglik, (model.log_q, model.log_r, model.start), linear)
+        return each(_loglik, (model.log_q, model.log_r, model.start), linear.filtered_from)
 
     def core(self, model) -> Core:
         """Parts of a model that a step changes."""

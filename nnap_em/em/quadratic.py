@@ -27,6 +27,11 @@ class Local(NamedTuple):
     reading_by_force: Float[Array, "*time obs port"] | None = None
     """Sensitivity of the reading to a force at its moment; None without a sensor of forces."""
 
+    @property
+    def filtered_from(self) -> tuple[Affine, Reading, Prepared]:
+        """What a filter needs: the same for any number of parameters, so that one program serves all."""
+        return self.affine, self.reading, self.seq
+
 
 class Quadratic(NamedTuple):
     """Log-likelihood about the present parameters: score and information of phi = (node torques, parameters)."""

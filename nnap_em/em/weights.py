@@ -1,5 +1,6 @@
 """Network weights and parameters as one vector, fitted to a log-likelihood that is quadratic in torques at nodes."""
 
+import dataclasses
 import math
 from typing import NamedTuple
 
@@ -92,20 +93,27 @@ class Weights(eqx.Module):
             blocks.append(precision / self.asymmetry[j] ** 2)
         return jax.scipy.linalg.block_diag(*blocks, jnp.zeros((self.prior.size,) * 2))
 
-    @eqx.filter_jit
     def prior_precision(self, unknown) -> Float[Array, "phi phi"]:
-        """Prior precision of phi: that of smooth maps as large as the one of `unknown`, and symmetry.
+        """Prior precision of phi: that of smooth maps as large as the one of `unknown`, and symmetry; 1 of parameters."""
+        size, more = self.nodes.size, self.prior.size
+        if self.known is not None:
+            maps = self.known.terms(size + more)[0]
+        else:  # one program for any parameters
+            none = ParameterPrior((), self.prior.mean[:0], self.prior.std[:0])
+            maps = jnp.pad(dataclasses.replace(self, prior=none, least=self.least[:0])._of_maps(unknown), (0, more))
+        return maps + jnp.diag(jnp.concatenate([jnp.zeros(size, maps.dtype), jnp.ones(more, maps.dtype)]))
+
+    @eqx.filter_jit
+    def _of_maps(self, unknown) -> Float[Array, "phi phi"]:
+        """Prior precision of the torques at the nodes.
 
         In function space and wider than the network's own prior, in which friction that rises steeply near rest is ten
         standard deviations away. Matern's covariance of order 5/2 over the nodes. [Rasmussen & Williams 2006, eq. 4.17;
         Khan, Immer, Abedi & Korzepa 2019, NeurIPS, for function space]
         """
-        if self.known is not None:
-            own = jnp.concatenate([jnp.zeros(self.nodes.size), jnp.ones(self.prior.size)])
-            return self.known.terms(own.size)[0] + jnp.diag(own)
         count, dtype = self.nodes.shape[1], self.centre.dtype
-        w = jnp.concatenate([unknown.weights(), jnp.zeros(self.prior.size, dtype)])
-        torque = self.phi(unknown, w)[: self.nodes.size].reshape(self.nodes.shape)
+        w = unknown.weights()
+        torque = self.phi(unknown, w).reshape(self.nodes.shape)
         variance = jnp.mean(torque**2, axis=1) + self.asymmetry[: len(self.nodes)] ** 2
         # Nodes over which the maps of the prior bend, of 41 a factor of 7 in velocity: on slides, pendulums and
         # acrobots with Stribeck friction 97 to 100 % of the truth near rest is then within two standard deviations;
@@ -115,16 +123,14 @@ class Weights(eqx.Module):
         grain = 1e-3  # standard deviation of a torque beside that, as a share of its own: what the curve itself may err
         smooth = (1 + apart + apart**2 / 3) * jnp.exp(-apart) + grain**2 * jnp.eye(count, dtype=dtype)
         own = jnp.linalg.inv(smooth)[None] / variance[:, None, None]
-        own = jax.scipy.linalg.block_diag(*own, jnp.eye(self.prior.size, dtype=dtype))
-        return self.symmetry(unknown, w) + own
+        return self.symmetry(unknown, w) + jax.scipy.linalg.block_diag(*own)
 
-    @eqx.filter_jit
-    def jacobian(self, unknown, w: Float[Array, " weight"]) -> Float[Array, "phi weight"]:
-        """Sensitivity of phi to the weights; nodes are independent."""
-        cut = w.shape[0] - self.prior.size
-        at = lambda v: jax.jacrev(lambda w: unknown.with_weights(w)(v))(w[:cut])  # noqa: E731
-        torque = jnp.swapaxes(jax.vmap(at)(self.nodes.T), 0, 1).reshape(self.nodes.size, cut)
-        return jax.scipy.linalg.block_diag(torque, jnp.eye(self.prior.size, dtype=w.dtype))
+    def slopes(self, unknown, w: Float[Array, " weight"]) -> Float[Array, "dof count own"]:
+        """Sensitivity of the torque of every node to the weights of its joint, which no other joint has."""
+        at = lambda v: jax.grad(lambda w: jnp.sum(unknown.with_weights(w)(v)))(w)  # noqa: E731
+        own = unknown.of_joint()
+        every = jax.vmap(at)(self.nodes.T)[:, own] if own.size else jnp.zeros((self.nodes.shape[1], *own.shape))
+        return jnp.moveaxis(every, 0, 1)
 
     def fit(
         self,
@@ -138,9 +144,10 @@ class Weights(eqx.Module):
 
         A parameter at its smallest value stays there while the likelihood falls inwards [Bertsekas 1982, SIAM J.
         Control Optim. 20(2)].
-        A step solves (A'A + D) step = gradient with A = root J, I = root' root, by the Woodbury identity: there are
-        fewer nodes than weights.
+        A step solves (J'IJ + D) step = gradient with I = root' root by the Woodbury identity: there are fewer nodes than
+        weights, and J has a block for every joint.
         """
+        shape, size, cut = self.nodes.shape, self.nodes.size, w0.shape[0] - self.prior.size
         phi0 = self.phi(unknown, w0)
         precision = self.precision(w0)
         middle = self.middle()
@@ -151,8 +158,14 @@ class Weights(eqx.Module):
         information = information + symmetry
         values, vectors = jnp.linalg.eigh(information)
         root = jnp.sqrt(jnp.maximum(values, 0.0))[:, None] * vectors.T
+        of_torque = root[:, :size].reshape(len(root), *shape)
+        blocks = jnp.einsum("fjc,fjd->jcd", of_torque, of_torque)
         least = jnp.full_like(w0, -jnp.inf)
-        least = least.at[w0.shape[0] - self.prior.size :].set(bounds(self.least, self.prior.size))
+        least = least.at[cut:].set(bounds(self.least, self.prior.size))
+        own = unknown.of_joint()
+
+        def joined(of_weights, of_parameters):
+            return jnp.concatenate([jnp.zeros(cut, w0.dtype).at[own].set(of_weights), of_parameters])
 
         def loss(w):
             d = self.phi(unknown, w) - phi0
@@ -164,13 +177,23 @@ class Weights(eqx.Module):
 
         def body(carry):
             w, value, damping, count, gain = carry
-            jac = self.jacobian(unknown, w)
-            gradient = jac.T @ (information @ (self.phi(unknown, w) - phi0) - score) + precision * (w - middle)
-            a = root @ jac
-            d = precision + damping * (precision + jnp.sum(a * a, axis=0))
+            jac = self.slopes(unknown, w[:cut])
+
+            def pulled(phi):
+                """J' phi."""
+                return joined(jnp.einsum("jco,jc->jo", jac, phi[:size].reshape(shape)), phi[size:])
+
+            gradient = pulled(information @ (self.phi(unknown, w) - phi0) - score) + precision * (w - middle)
+            square = joined(jnp.einsum("jco,jcd,jdo->jo", jac, blocks, jac), jnp.diagonal(information)[size:])
+            d = precision + damping * (precision + square)
             d = jnp.where((w <= least) & (gradient > 0), jnp.inf, d)
-            inner = jax.scipy.linalg.cho_factor(jnp.eye(a.shape[0], dtype=a.dtype) + (a / d[None]) @ a.T)
-            step = (gradient - a.T @ jax.scipy.linalg.cho_solve(inner, a @ (gradient / d))) / d
+            wide = jnp.einsum("jco,jo,jdo->jcd", jac, 1 / d[own], jac)  # of J D^-1 J'
+            half = jnp.einsum("fjc,jcd->fjd", of_torque, wide).reshape(len(root), size)
+            half = jnp.concatenate([half, root[:, size:] / d[None, cut:]], axis=1)
+            inner = jax.scipy.linalg.cho_factor(jnp.eye(len(root), dtype=root.dtype) + half @ root.T)
+            newton = gradient / d
+            moved = jnp.concatenate([jnp.einsum("jco,jo->jc", jac, newton[own]).ravel(), newton[cut:]])
+            step = (gradient - pulled(root.T @ jax.scipy.linalg.cho_solve(inner, root @ moved))) / d
             trial = jnp.maximum(w - step, least)
             new = loss(trial)
             better = new < value

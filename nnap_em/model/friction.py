@@ -6,8 +6,9 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from ..numerics.elementary import asinh
 
@@ -106,6 +107,12 @@ class FrictionNetwork(AbstractJointMap):
         """All network weights as one vector."""
         return ravel_pytree(eqx.filter(self.mlp, eqx.is_inexact_array))[0]
 
+    def of_joint(self) -> Int[np.ndarray, "dof own"]:
+        """Places in `weights` of those of each joint."""
+        leaves = jax.tree.leaves(eqx.filter(self.mlp, eqx.is_inexact_array))
+        joint = [np.repeat(np.arange(len(leaf)), leaf.size // len(leaf)) for leaf in leaves]
+        return np.argsort(np.concatenate(joint), kind="stable").reshape(len(self.scale), -1)
+
     @eqx.filter_jit
     def with_weights(self, flat: Float[Array, " weight"]) -> "FrictionNetwork":
         """This map with the weights replaced."""
@@ -154,6 +161,10 @@ class FixedFriction(eqx.Module):
     def weights(self) -> Float[Array, " 0"]:
         """None."""
         return jnp.zeros(0)
+
+    def of_joint(self) -> Int[np.ndarray, "dof 0"]:
+        """None."""
+        return np.zeros((len(self.nodes(0)), 0), int)
 
     def with_weights(self, flat: Float[Array, " 0"]) -> "FixedFriction":
         """This map."""

@@ -47,7 +47,10 @@ class RK4(diffrax.AbstractSolver):
             return (after, [a + share * point[i] for i, a in enumerate(y1)]), None
 
         start = list(y0)  # entry by entry: a batch of states is then a batch of each entry, without strides
-        (last, y1), _ = jax.lax.scan(stage, (start, [jnp.zeros_like(a) for a in start]), (times, ahead, share))
+        nothing = [
+            a - a for a in start
+        ]  # what is batched and moves as the loop's results are is traced once, not twice
+        (last, y1), _ = jax.lax.scan(stage, (start, nothing), (times, ahead, share))
         y1 = [a + b for a, b in zip(y1, last, strict=True)]
         y1 = tuple(y1) if isinstance(y0, tuple) else jnp.stack(y1)
         return y1, None, {"y0": y0, "y1": y1}, None, diffrax.RESULTS.successful
@@ -76,6 +79,8 @@ def integrate(
         x, *_ = solver.step(term, zero, h, x, step, None, made_jump=False)
         return x, None
 
+    if substeps == 1:  # a loop in a loop is traced twice as often
+        return jnp.stack(body(tuple(x), zero if timed else None)[0])
     entries, _ = jax.lax.scan(body, tuple(x), jnp.arange(substeps, dtype=x.dtype) if timed else None, length=substeps)
     return jnp.stack(entries)
 

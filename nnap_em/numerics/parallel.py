@@ -93,13 +93,12 @@ def each(function: Callable, common: Any, batch: Any, *, together: int | None = 
         group = min(together or GROUP, GROUP, 1 << (share - 1).bit_length())
     at_once = group * (1 if mesh is None else mesh.size)
     program, parts = _program(function), []
-    if mesh is not None:
-        common = _place(common, NamedSharding(mesh, P()))
+    common = on_default_device(common) if mesh is None else _place(common, NamedSharding(mesh, P()))
     for first in range(0, count, at_once):
         index = np.minimum(np.arange(first, first + at_once), count - 1)  # padding repeats the last entry
         some = jax.tree.map(lambda a: a if len(a) == at_once else _taken(a, index), batch)  # noqa: B023
         if mesh is None:
-            parts.append(program(None, *on_default_device((common, some))))
+            parts.append(program(None, common, on_default_device(some)))
         else:
             parts.append(_gather(program(mesh, common, _place(some, NamedSharding(mesh, P(AXIS))))))
     if count == at_once:

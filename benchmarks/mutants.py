@@ -566,15 +566,16 @@ an angle that is read late has no hypotheses
 a gap does not end a sequence
 - np.diff(signal.t) > signal.longest)
 + np.diff(signal.t) > 9 * signal.longest)
-# import_/ros2.py
-## test_recordings.py::test_a_message_is_laid_out_as_it_was_written[padding]
-alignment counted from the encapsulation
-- -(self.at - _HEAD) % width
-+ -self.at % width
-## test_recordings.py::test_messages_of_many_forms_on_one_topic_are_those_of_the_generic_decoder
-names are no part of the form of a message
-- self.text(named=field in NAMES)
-+ self.text(named=False)
+# import_/objects.py
+## test_recordings.py::test_messages_of_many_forms_on_one_topic_are_read_by_the_names_in_each
+names of the first message are those of all
+- (places := _places(tuple(found)))
++ (places := _places(("a", "b")))
+# import_/bags.py
+## test_recordings.py::test_bags_of_ros_1_and_2_are_read[1-a.bag]
+nanoseconds of a stamp left out
+- stamp[1].astype(np.int64)
++ 0 * stamp[1].astype(np.int64)
 # import_/clock.py
 ## test_recordings.py::test_which_clock_is_taken_and_why[backwards]
 header stamps that run backwards are taken

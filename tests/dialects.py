@@ -1,6 +1,7 @@
 """Logs as drives, PLCs and tools write them, made from what their documentation says."""
 
 import struct
+import zipfile
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -48,6 +49,31 @@ def twincat(path: Path, *, ticks: bool = False, separator: str = "\t", decimal: 
         body.append([time, _number(np.degrees(Q[k]), decimal), _number(V[k], decimal), *slow])
     lines = [*head * full, *(separator.join(row) for row in rows), *([""] * full)]
     return _write(path, [*lines, *(separator.join(row) for row in body), "EOF"])
+
+
+def workbook(path: Path, columns: dict[str, np.ndarray]) -> Path:
+    """An Excel workbook of one sheet, texts inside the cells [ECMA-376, part 1, 18.3]."""
+    cell = lambda x: f'<c t="inlineStr"><is><t>{x}</t></is></c>' if isinstance(x, str) else f"<c><v>{x!r}</v></c>"  # noqa: E731
+    rows = [[*columns], *zip(*(y.tolist() for y in columns.values()), strict=True)]
+    sheet = "".join(f"<row>{''.join(map(cell, row))}</row>" for row in rows)
+    main, office = (
+        f"http://schemas.openxmlformats.org/{of}" for of in ("spreadsheetml/2006/main", "officeDocument/2006")
+    )
+    package = "http://schemas.openxmlformats.org/package/2006"
+    link = lambda kind, to: (  # noqa: E731
+        f'<Relationships xmlns="{package}/relationships">'
+        f'<Relationship Id="r1" Type="{office}/relationships/{kind}" Target="{to}"/></Relationships>'
+    )
+    book = f'<sheets><sheet name="a" sheetId="1" r:id="r1" xmlns:r="{office}/relationships"/></sheets>'
+    with zipfile.ZipFile(path, "w") as file:
+        file.writestr("[Content_Types].xml", f'<Types xmlns="{package}/content-types"/>')
+        file.writestr("_rels/.rels", link("officeDocument", "xl/workbook.xml"))
+        file.writestr("xl/workbook.xml", f'<workbook xmlns="{main}">{book}</workbook>')
+        file.writestr("xl/_rels/workbook.xml.rels", link("worksheet", "worksheets/sheet1.xml"))
+        file.writestr(
+            "xl/worksheets/sheet1.xml", f'<worksheet xmlns="{main}"><sheetData>{sheet}</sheetData></worksheet>'
+        )
+    return path
 
 
 def codesys(path: Path, flags: int = 16) -> Path:

@@ -178,7 +178,7 @@ def test_a_unit_in_the_name_of_a_mapped_column_scales_it_or_is_refused(tmp_path,
     np.testing.assert_allclose(table[:, place], 3 * COLUMNS[1 + place], rtol=1e-8, atol=3e-8)
 
 
-@pytest.mark.parametrize("suffix", ["mat", "parquet", "h5", "mcap"])
+@pytest.mark.parametrize("suffix", ["mat", "parquet", "h5", "mcap", "xlsx"])
 def test_a_unit_in_a_name_counts_in_every_format(tmp_path, suffix):
     columns = {"time": T, "Torque [Nm]": U, "Angle [deg]": np.degrees(Q), "Speed [rpm]": V * 30 / np.pi}
     log, topic = tmp_path / f"a.{suffix}", "/a:" if suffix in ("h5", "mcap") else ""
@@ -190,6 +190,8 @@ def test_a_unit_in_a_name_counts_in_every_format(tmp_path, suffix):
         pq.write_table(pa.table(columns), log)
     elif suffix == "h5":
         write_hdf5(log, {"a": columns})
+    elif suffix == "xlsx":
+        dialects.workbook(log, columns)
     else:
         rows = zip(*(y.tolist() for y in columns.values()), strict=True)
         write_mcap(log, {"/a": (plain_json(), ns(T), [dict(zip(columns, row, strict=True)) for row in rows])})
@@ -271,9 +273,9 @@ def _last(row: str, decimal: str = "."):
 REFUSED = {  # what writes a file, its name, and words of the message
     "Dataset": (DATASET, "a.mat", "variable 'logsout'", "for k = 1:logsout.numElements", "'-struct'"),
     "timeseries": (SERIES, "a.mat", STRUCT),
-    "bag": (None, "run.bag", "rosbags-convert --src", "run.bag --dst run_mcap --dst-storage mcap"),
-    "db3": (None, "run.db3", "pip install rosbags", "run.db3 --dst run_mcap --dst-storage mcap"),
-    "xlsx": (None, "a.xlsx", "save the sheet as CSV"),
+    "bag": (None, "run.bag", "the file is damaged", "use another copy"),
+    "db3": (None, "run.db3", "the file is damaged", "use another copy"),
+    "xlsx": (None, "a.xlsx", "no workbook, or damaged", "save the sheet as CSV"),
     "CODESYS binary": (None, "a.trace", "*.trace.csv"),
     "TwinCAT recording": (None, "a.svdx", "TC3ScopeExportTool.exe svd="),
     "commas twice": (_table(_names(","), COLUMNS, ",", ","), "a.csv", "fields under 4 names", "decimals with '.'"),

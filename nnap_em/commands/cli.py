@@ -77,7 +77,7 @@ def parser() -> argparse.ArgumentParser:
         simulate.add_argument(f"--{kind}-noise", nargs=2, type=_positive, metavar=("POSITION", "RATE"), help=text)
 
     init = command("init")
-    _file(init, "log", "LOG", "a CSV file with a header, MCAP or HDF5")
+    _file(init, "log", "LOG", "a CSV file with a header, MCAP, ROS bag or HDF5")
     machine = init.add_mutually_exclusive_group()
     machine.add_argument("--system", choices=SYSTEMS, help="the machine, where the columns do not determine it")
     text = 'the machine as MJCF or URDF, which stays where it is, or "equations" to be written'
@@ -86,7 +86,7 @@ def parser() -> argparse.ArgumentParser:
 
     several: dict[str, Any] = {"action": "append", "default": []}
     importing = command("import")
-    _file(importing, "logs", "LOG", "MCAP, HDF5, CSV, Parquet or MAT", nargs="+")
+    _file(importing, "logs", "LOG", "MCAP, ROS bag, HDF5, CSV, Excel, Parquet or MAT", nargs="+")
     _file(importing, "--rig", "RIG", "rig.toml; its [import] says what is where", required=True)
     _file(importing, "--out", "FOLDER", "the new data set", required=True)
     text = "last sequences kept for the test, or share (0.2)"

@@ -94,7 +94,7 @@ class Weights(eqx.Module):
         return jax.scipy.linalg.block_diag(*blocks, jnp.zeros((self.prior.size,) * 2))
 
     def prior_precision(self, unknown) -> Float[Array, "phi phi"]:
-        """Prior precision of phi: that of smooth maps as large as the one of `unknown`, and symmetry; 1 of parameters."""
+        """Prior precision of phi: of smooth maps as large as the one of `unknown`, with symmetry; 1 of parameters."""
         size, more = self.nodes.size, self.prior.size
         if self.known is not None:
             maps = self.known.terms(size + more)[0]
@@ -144,8 +144,8 @@ class Weights(eqx.Module):
 
         A parameter at its smallest value stays there while the likelihood falls inwards [Bertsekas 1982, SIAM J.
         Control Optim. 20(2)].
-        A step solves (J'IJ + D) step = gradient with I = root' root by the Woodbury identity: there are fewer nodes than
-        weights, and J has a block for every joint.
+        A step solves (J'IJ + D) step = gradient with I = root' root by the Woodbury identity: there are fewer nodes
+        than weights, and J has a block for every joint.
         """
         shape, size, cut = self.nodes.shape, self.nodes.size, w0.shape[0] - self.prior.size
         phi0 = self.phi(unknown, w0)

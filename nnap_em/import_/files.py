@@ -4,11 +4,13 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from ..data.dataset import DataError
-from . import hdf5_file, mcap_file, table_file, text_file
+from . import bags, hdf5_file, table_file, text_file
 from .recording import Address, Reader, Recording
 
 readers: dict[str, Reader] = {
-    ".mcap": mcap_file,
+    ".mcap": bags,
+    ".db3": bags,
+    ".bag": bags,
     ".h5": hdf5_file,
     ".hdf5": hdf5_file,
     ".csv": table_file,
@@ -17,16 +19,10 @@ readers: dict[str, Reader] = {
     ".txt": text_file,
     ".tsv": text_file,
     ".lvm": text_file,
+    **dict.fromkeys(text_file.SHEETS, text_file),
 }
 """Reader by the end of the name; for another kind of file, add one that has `topics` and `read`."""
-_ROS = (
-    "pip install rosbags; rosbags-convert --src {path} --dst {stem}_mcap --dst-storage mcap (and give the .mcap in it)"
-)
 _ELSEWHERE = {
-    ".bag": _ROS,
-    ".db3": _ROS,
-    ".xlsx": "save the sheet as CSV UTF-8",
-    ".xls": "save the sheet as CSV UTF-8",
     ".trace": "save the trace as *.trace.csv in CODESYS",
     ".svdx": "export it as CSV: TC3ScopeExportTool.exe svd={path} target={stem}.csv silent",
     ".svd": "export it as CSV: TC3ScopeExportTool.exe svd={path} target={stem}.csv silent",

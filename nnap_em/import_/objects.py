@@ -1,8 +1,11 @@
 """Numbers of decoded messages: dicts, lists and objects with fields, whoever decoded them."""
 
+import functools
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
+
+import numpy as np
 
 from .recording import steps
 
@@ -19,13 +22,18 @@ def flatten(message: Any) -> dict[str, float]:
 
 def pick(message: Any, path: str) -> float:
     """The number at a path; NaN where the message has none."""
-    (at, names), parent = _way(message, path), None
+    at, names, parent = message, steps(path), None
+    while isinstance(at, dict) and path not in at and isinstance(at.get(path.partition(".")[0]), dict):
+        head, _, path = path.partition(".")
+        at, names = at[head], steps(path)
+    if isinstance(at, dict) and path in at:  # a name with dots or brackets, as `Torque [Nm]`, is one step
+        names = (path,)
     try:
         for step in names:
             if isinstance(step, int):
                 at = at[step]
-            elif step.startswith("["):
-                at = at[list(_names(parent)).index(step[1:])]
+            elif step[0] == "[":
+                at = at[_names(parent)[step[1:]]]
             else:
                 at, parent = _get(at, step), at
         return math.nan if at is None or isinstance(at, str) else float(at)
@@ -33,16 +41,8 @@ def pick(message: Any, path: str) -> float:
         return math.nan
 
 
-def _way(message: Any, path: str) -> tuple[Any, Iterable[str | int]]:
-    """Start and steps of a path; a name with dots or brackets, as `Torque [Nm]`, is one step."""
-    while isinstance(message, Mapping) and path not in message and isinstance(message.get(path.split(".")[0]), Mapping):
-        head, _, path = path.partition(".")
-        message = message[head]
-    return message, [path] if isinstance(message, Mapping) and path in message else steps(path)
-
-
 def _numbers(at: Any, path: str) -> Iterator[tuple[str, float]]:
-    if isinstance(at, bool | int | float):
+    if isinstance(at, bool | int | float | np.number | np.bool_):
         yield path, float(at)
     elif _is_list(at):
         for i, item in enumerate(at[:LISTED_ENTRIES]):
@@ -59,26 +59,31 @@ def _numbers(at: Any, path: str) -> Iterator[tuple[str, float]]:
 
 
 def _is_list(value: Any) -> bool:
-    return (isinstance(value, Sequence) and not isinstance(value, str | bytes)) or hasattr(value, "typecode")
+    return isinstance(value, Sequence | np.ndarray) and not isinstance(value, str | bytes)
 
 
-def _names(parent: Any) -> Sequence[str]:
-    """The names of the entries, different texts all."""
+def _names(parent: Any) -> dict[str, int]:
+    """Places of the entries by their names, different texts all."""
     for field in NAMES:
-        names = _get(parent, field, None)
-        if names and _is_list(names) and all(isinstance(n, str) and n for n in names) and len(set(names)) == len(names):
-            return list(names)
-    return []
+        found = _get(parent, field, None)
+        if _is_list(found) and all(isinstance(name, str) for name in found) and (places := _places(tuple(found))):
+            return places
+    return {}
+
+
+@functools.lru_cache
+def _places(names: tuple[str, ...]) -> dict[str, int]:
+    return {name: i for i, name in enumerate(names)} if all(names) and len(set(names)) == len(names) else {}
 
 
 def _fields(at: Any) -> Sequence[str]:
-    if isinstance(at, Mapping):
+    if isinstance(at, dict):
         return [str(name) for name in at]
     described = getattr(at, "DESCRIPTOR", None)
-    return [field.name for field in described.fields] if described else list(getattr(at, "__slots__", vars(at)))
+    return [field.name for field in described.fields] if described else list(vars(at))
 
 
 def _get(at: Any, field: str, *absent: Any) -> Any:
-    if isinstance(at, Mapping):
+    if isinstance(at, dict):
         return at.get(field, *absent) if absent else at[field]
     return getattr(at, field, *absent)

@@ -1,7 +1,8 @@
 """Content of a recording, whatever file it came from: topics with numbers at times of their own."""
 
+import functools
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple, Protocol, runtime_checkable
 
@@ -127,10 +128,11 @@ def places(topics: Iterable[Topic]) -> list[tuple[Address, str]]:
     return [(Address(topic, field, None if size == 1 else size), word) for topic, field, word, size in every]
 
 
-def steps(path: str) -> Iterator[str | int]:
+@functools.cache
+def steps(path: str) -> tuple[str | int, ...]:
     """The way to a number: names of fields, then indices and names in brackets as ints and as `[name`."""
-    for name, index in re.findall(r"([^.\[\]]+)|\[([^\]]*)\]", path):
-        yield name or (int(index) if index.isdigit() else f"[{index}")
+    found = re.findall(r"([^.\[\]]+)|\[([^\]]*)\]", path)
+    return tuple(name or (int(index) if index.isdigit() else f"[{index}") for name, index in found)
 
 
 def field_of(file: Path, topic: Topic, path: str, where: str) -> str:

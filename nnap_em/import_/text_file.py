@@ -12,14 +12,17 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Int
 
+from ..data.dataset import DataError
 from ..data.formats import check_size, number, numbers, read_bytes, refuse, split
 from ..data.units import clock_of, is_episode, named_unit
 from ..numerics.digits import counted
 from .clock import in_a_row, nanoseconds, rising
-from .recording import SECOND, UNTIMED, Recording, Topic, Track
+from .recording import EXTRA, SECOND, UNTIMED, Recording, Topic, Track
 
 MARKS = ((",", "."), (";", "."), (";", ","), ("\t", "."), ("\t", ","), ("", "."), ("", ","), (",", ","))
 """Marks of columns (none: blanks) and of decimals; of two that explain a file alike, the first counts."""
+SHEETS = (".xlsx", ".xls", ".ods")
+"""Ends of the names of workbooks."""
 CODESYS = "[key]"
 """First word of a CODESYS trace."""
 Cells = tuple[Sequence[int], Sequence[str]]
@@ -149,7 +152,7 @@ DIALECTS = (_twincat, _labview, _header)
 def _blocks(path: Path) -> dict[str, Block]:
     """The columns by their clocks, those with the same times together."""
     check_size(path)
-    lines = _decoded(read_bytes(path)).rstrip().split("\n")
+    lines = _sheet(path) if path.suffix.lower() in SHEETS else _decoded(read_bytes(path)).rstrip().split("\n")
     out: list[Block] = []
     for block in (_codesys if lines[0].startswith(CODESYS) else _table)(path, lines):
         same = [k for k, other in enumerate(out) if other.t is not None and np.array_equal(other.t, block.t)]  # pyright: ignore[reportArgumentType]
@@ -160,6 +163,20 @@ def _blocks(path: Path) -> dict[str, Block]:
     if not out:
         refuse(path, "the file", "holds no column of numbers under a name", "write a header, then rows of numbers")
     return {f"clock {k}" if len(out) > 1 else "": block for k, block in enumerate(out, 1)}
+
+
+def _sheet(path: Path) -> list[str]:
+    """The rows of the first sheet of a workbook, fields separated by tabulators, dates as ISO 8601."""
+    try:
+        import python_calamine
+    except ImportError:
+        raise DataError(f"{path}: workbooks cannot be read without python-calamine; {EXTRA}") from None
+    try:
+        rows = python_calamine.CalamineWorkbook.from_path(path).get_sheet_by_index(0).to_python(skip_empty_area=False)
+    except Exception as error:  # whatever the parser raises on bytes that are no workbook
+        raise DataError(f"{path}: no workbook, or damaged ({error}); save the sheet as CSV UTF-8") from None
+    text = lambda cell: cell.isoformat() if hasattr(cell, "isoformat") else str(cell)  # noqa: E731
+    return ["\t".join(map(text, row)) for row in rows] or [""]
 
 
 def _table(path: Path, lines: Sequence[str]) -> Iterator[Block]:

@@ -47,9 +47,7 @@ class RK4(diffrax.AbstractSolver):
             return (after, [a + share * point[i] for i, a in enumerate(y1)]), None
 
         start = list(y0)  # entry by entry: a batch of states is then a batch of each entry, without strides
-        nothing = [
-            a - a for a in start
-        ]  # what is batched and moves as the loop's results are is traced once, not twice
+        nothing = [a - a for a in start]  # batched as the loop's results are, which is then traced once, not twice
         (last, y1), _ = jax.lax.scan(stage, (start, nothing), (times, ahead, share))
         y1 = [a + b for a, b in zip(y1, last, strict=True)]
         y1 = tuple(y1) if isinstance(y0, tuple) else jnp.stack(y1)

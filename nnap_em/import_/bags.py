@@ -1,0 +1,261 @@
+"""Recordings of robots: MCAP files, and bags of ROS 1 and 2; their messages are decoded one by one."""
+
+import json
+import struct
+from array import array
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from ..data.dataset import DataError
+from ..data.formats import unreadable
+from .clock import choose
+from .objects import flatten, pick
+from .recording import EXTRA, OTHER, Recording, Topic, Track, refuse
+
+SAMPLES = 20
+"""Messages of a channel that are looked at for its fields: not every message needs to have them all."""
+
+
+class Channel(NamedTuple):
+    """Messages of one type on one topic."""
+
+    topic: str
+    kind: str
+    """Type and encoding, for people."""
+    messages: int | None
+    """Number of messages; None where the file does not have it."""
+    decode: Callable[[bytes], Any]
+    """Message of its bytes; raises Unread where the encoding is unknown, and anything for damaged bytes."""
+
+
+class Unread(ValueError):
+    """An encoding or a schema that is not read, with the reason."""
+
+
+class _Log:
+    """An open file: its channels, which may appear on the way, and the numbers, times and bytes of its messages."""
+
+    def __init__(self) -> None:
+        self.channels: dict[int, Channel] = {}
+        self.notes: tuple[str, ...] = ()
+        self.messages: Iterator[tuple[int, int, bytes]] = iter(())
+
+
+def topics(path: Path) -> tuple[Topic, ...]:
+    """Topics of the file; it is read until the first messages of each channel were seen."""
+    samples: dict[int, list[bytes]] = defaultdict(list)
+    with _opened(path) as log:
+        for number, _, data in log.messages:
+            if len(samples[number]) < SAMPLES:
+                samples[number].append(data)
+                counts = {number: channel.messages for number, channel in log.channels.items()}
+                if all(n is not None and len(samples[i]) >= min(n, SAMPLES) for i, n in counts.items()):
+                    break
+        by_name: dict[str, Topic] = {}
+        for number, (name, kind, count, decode) in sorted(log.channels.items()):
+            fields: list[str] = []
+            try:
+                fields = [field for data in samples[number] for field in flatten(decode(data))]
+            except Unread as unread:
+                kind = f"{kind}: {unread}"
+            except Exception as error:
+                kind = f"{kind}: its messages do not fit their schema ({type(error).__name__})"
+            before = by_name.get(name, Topic(name, kind, 0, ()))
+            total = None if count is None or before.messages is None else before.messages + count
+            by_name[name] = Topic(name, kind, total, tuple(dict.fromkeys([*before.fields, *fields])))
+    return tuple(by_name.values())
+
+
+class _Columns:
+    """What is kept of one topic: log times, and the numbers of each path, those of the header stamp after them."""
+
+    def __init__(self, paths: Sequence[str], stamp: Sequence[str]):
+        self.paths, self.stamp = paths, stamp
+        self.t, self.values = array("q"), [array("d") for _ in (*paths, *stamp)]
+
+    def add(self, t: int, message: Any) -> None:
+        """One message."""
+        self.t.append(t)
+        for values, path in zip(self.values, (*self.paths, *self.stamp), strict=True):
+            values.append(pick(message, path))
+
+    def track(self, path: Path, topic: str) -> Track:
+        """The messages, in the order of the clock that is taken."""
+        columns = [np.array(values) for values in self.values]
+        clock = choose(path, topic, np.array(self.t), _nanoseconds(*columns[len(self.paths) :]))
+        return clock.track(zip(self.paths, columns[: len(self.paths)], strict=True))
+
+
+def read(path: Path, fields: Mapping[str, Sequence[str]]) -> Recording:
+    """The numbers at these paths of these topics, in the order of their times."""
+    every: dict[str, _Columns] = {}
+    with _opened(path) as log:
+        for number, t, data in log.messages:
+            topic = log.channels[number].topic
+            if topic not in fields:
+                continue
+            try:
+                message = log.channels[number].decode(data)
+            except Unread as unread:
+                refuse(path, f"topic {topic!r}", str(unread), OTHER)
+            except Exception as error:  # what the decoders raise on damaged bytes is open-ended
+                problem = f"a message does not fit its schema ({' '.join(str(error).split()) or type(error).__name__})"
+                hint = "the recorder wrote another type than it said: record again, or name another topic"
+                refuse(path, f"topic {topic!r}", problem, hint)
+            if topic not in every:
+                every[topic] = _Columns(fields[topic], _stamp(flatten(message)))
+            every[topic].add(t, message)
+        for topic in fields:
+            if topic not in every:
+                refuse(path, f"topic {topic!r}", "has no messages", "name another topic, or take the log out")
+        return Recording(path, {topic: every[topic].track(path, topic) for topic in fields}, log.notes)
+
+
+def _stamp(fields: Mapping[str, float]) -> tuple[str, ...]:
+    """The fields that hold the time at which a message was measured: seconds, and nanoseconds of a second."""
+    stamps = [
+        (f"{place}.{seconds}", f"{place}.{nanoseconds}")
+        for place in ("header.stamp", "stamp", "timestamp", "header.timestamp")
+        for seconds, nanoseconds in (("sec", "nanosec"), ("sec", "nsec"), ("secs", "nsecs"), ("seconds", "nanos"))
+    ]
+    return next((pair for pair in stamps if all(name in fields for name in pair)), ())
+
+
+def _nanoseconds(*stamp: Float[np.ndarray, " message"]) -> Int[np.ndarray, " message"] | None:
+    """Stamps of seconds and nanoseconds, where every message has one."""
+    if not stamp or not np.isfinite(stamp).all():
+        return None
+    return stamp[0].astype(np.int64) * 1_000_000_000 + stamp[1].astype(np.int64)
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[_Log]:
+    """The file; mistakes as a DataError."""
+    try:
+        import mcap.exceptions
+        import rosbags.highlevel  # noqa: F401
+    except ImportError:
+        raise DataError(f"{path}: recordings cannot be read without mcap and rosbags; {EXTRA}") from None
+    opened = _mcap if path.suffix.lower() == ".mcap" else _bag
+    try:
+        with opened(path) as log:
+            yield log
+    except DataError:
+        raise
+    except OSError as error:
+        raise unreadable(path, error) from None
+    except mcap.exceptions.InvalidMagic:
+        refuse(path, "the file", "no MCAP file", "give a file that an MCAP recorder wrote")
+    except Exception as error:  # what the parsers raise on damaged bytes is open-ended
+        problem = " ".join(str(error).split()) or type(error).__name__
+        raise DataError(f"{path}: the file is damaged ({problem}); use another copy, or repair it") from None
+
+
+@contextmanager
+def _mcap(path: Path) -> Iterator[_Log]:
+    """An MCAP file, whose head is read where its end is missing [mcap.dev/spec]."""
+    from mcap.exceptions import EndOfFile
+    from mcap.reader import SeekingReader
+    from mcap.records import Channel as ChannelRecord
+    from mcap.records import Message, Schema
+    from mcap.stream_reader import StreamReader
+
+    with path.open("rb") as file:
+        log, schemas, counts = _Log(), {}, None
+        try:
+            summary = SeekingReader(file).get_summary()
+        except Exception:  # damaged, or cut short
+            summary = None
+        file.seek(0)
+
+        def channel(record: Any) -> Channel:
+            schema, count = schemas.get(record.schema_id), None if counts is None else counts.get(record.id, 0)
+            kind = f"{schema.name if schema else 'no schema'}, {record.message_encoding}"
+            return Channel(record.topic, kind, count, _decoder(record.message_encoding, schema))
+
+        if summary is not None:
+            schemas |= summary.schemas
+            counts = dict(summary.statistics.channel_message_counts) if summary.statistics else None
+            log.channels |= {number: channel(record) for number, record in summary.channels.items()}
+
+        def messages() -> Iterator[tuple[int, int, bytes]]:
+            count = 0
+            try:
+                for record in StreamReader(file, validate_crcs=True).records:
+                    if isinstance(record, Schema):
+                        schemas[record.id] = record
+                    elif isinstance(record, ChannelRecord) and record.id not in log.channels:
+                        log.channels[record.id] = channel(record)
+                    elif isinstance(record, Message):
+                        count += 1
+                        yield record.channel_id, record.log_time, record.data
+            except (EndOfFile, struct.error):
+                if file.read(1):
+                    raise
+                log.notes = (f"the file is cut short: what is whole was read, {count} messages",)
+
+        log.messages = messages()
+        yield log
+
+
+@contextmanager
+def _bag(path: Path) -> Iterator[_Log]:
+    """A bag of ROS 1, or a database of ROS 2, whose older ones do not hold their definitions."""
+    from rosbags.highlevel import AnyReader
+    from rosbags.typesys import Stores, get_typestore
+
+    with AnyReader([path], default_typestore=get_typestore(Stores.LATEST)) as bag:
+        log = _Log()
+        for one in bag.connections:
+            decode = lambda data, kind=one.msgtype: bag.deserialize(data, kind)  # noqa: E731
+            log.channels[one.id] = Channel(one.topic, one.msgtype, one.msgcount, decode)
+        log.messages = ((one.id, t, data) for one, t, data in bag.messages())
+        yield log
+
+
+def _decoder(encoding: str, schema: Any) -> Callable[[bytes], Any]:
+    """Decoder of the messages of an MCAP file."""
+    try:
+        if encoding not in _decoders:
+            raise Unread(f"encoding {encoding!r} is not read")
+        return _decoders[encoding](schema)
+    except Unread as error:
+        reason = error
+    except Exception as error:
+        reason = Unread(f"its schema cannot be parsed ({error})")
+
+    def refused(_: bytes) -> Any:
+        raise reason
+
+    return refused
+
+
+def _cdr(schema: Any) -> Callable[[bytes], Any]:
+    from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
+
+    if schema is None or schema.encoding not in ("ros2msg", "ros2idl"):
+        raise Unread(f"schema encoding {schema.encoding if schema else 'none'!r} of CDR messages is not read")
+    store, text = get_typestore(Stores.EMPTY), schema.data.decode()
+    store.register(get_types_from_msg(text, schema.name) if schema.encoding == "ros2msg" else get_types_from_idl(text))
+    return lambda data: store.deserialize_cdr(data, schema.name)
+
+
+def _protobuf(schema: Any) -> Callable[[bytes], Any]:
+    from mcap_protobuf.decoder import DecoderFactory
+
+    if (decode := DecoderFactory().decoder_for("protobuf", schema)) is None:
+        raise Unread("protobuf without a protobuf schema is not read")
+    return decode
+
+
+_decoders: dict[str, Callable[[Any], Callable[[bytes], Any]]] = {
+    "cdr": _cdr,
+    "json": lambda schema: json.loads,
+    "protobuf": _protobuf,
+}

@@ -1,9 +1,9 @@
-"""How many faults a run survives: killed at random moments and resumed, does it end with the numbers of no fault?
+"""How many faults a run survives: killed at random moments and started again, does it end with the numbers of no fault?
 
     python benchmarks/faults.py --faults 40 --table docs/results/faults.md     # some ten minutes on one core
 
 A run is killed (SIGKILL, or SIGINT as by Ctrl-C) at a moment drawn from the length of an unbroken run, and started
-again with --resume, until it ends before the next fault comes.  Its faults count as survived if all numbers, to the
+again, until it ends before the next fault comes.  Its faults count as survived if all numbers, to the
 last bit, are those of the unbroken run, and if after every SIGINT it said what it kept and ended with status 130.
 """
 
@@ -51,17 +51,17 @@ def numbers(out: Path) -> dict:
     return contents | {"report": report}
 
 
-def start(command: str, rig: Path, out: Path, *more: str) -> subprocess.Popen:
+def start(command: str, rig: Path, out: Path) -> subprocess.Popen:
     """The command in a process of its own."""
-    order = [sys.executable, "-m", "nnap_em.commands.cli", command, str(rig), "--out", str(out), *more]
+    order = [sys.executable, "-m", "nnap_em.commands.cli", command, str(rig), "--out", str(out)]
     return subprocess.Popen(order, stderr=subprocess.PIPE, text=True)
 
 
 def broken(command: str, rig: Path, out: Path, length: float, rng: random.Random) -> tuple[dict[str, int], bool]:
     """A run with faults until it ends: how many of each kind, and whether it was told well what was kept."""
-    tried, stated, more = {"SIGKILL": 0, "SIGINT": 0}, True, ()
+    tried, stated = {"SIGKILL": 0, "SIGINT": 0}, True
     while True:
-        run, kind = start(command, rig, out, *more), rng.choice(list(tried))
+        run, kind = start(command, rig, out), rng.choice(list(tried))
         try:
             _, said = run.communicate(timeout=rng.uniform(0.0, length))
             if run.returncode:
@@ -79,7 +79,6 @@ def broken(command: str, rig: Path, out: Path, length: float, rng: random.Random
             stated = stated and well
             if not well:
                 print(f"status {run.returncode}: {said}", file=sys.stderr)
-        more = ("--resume",)
 
 
 def main() -> None:
@@ -114,8 +113,8 @@ def main() -> None:
     note = (
         f"`benchmarks/faults.py`, {date.today()}, JAX {jax.__version__}, Python {platform.python_version()}, "
         f"{len(os.sched_getaffinity(0))} core, seed {args.seed}: a slide with an undeclared spring, broken at random "
-        "moments and resumed. Survived: every number, to the last bit, is that of the unbroken run, and Ctrl-C was "
-        "answered with what is kept."
+        "moments and started again. Survived: every number, to the last bit, is that of the unbroken run, and Ctrl-C "
+        "was answered with what is kept."
     )
     text = f"# Faults survived\n\n{note}\n\n{head}\n" + "\n".join(rows) + "\n"
     print(text)

@@ -6,7 +6,7 @@ on each of them
     python -m nnap_em.launch --coordinator HOST:PORT --first K --here N COUNT identify FOLDER --out OUT
 
 HOST is the first machine and PORT free there; K processes run on the machines before this one, N on this one, and COUNT
-in all.  FOLDER is needed on each, and OUT too where the command has --resume.
+in all.  FOLDER is needed on each, and OUT too where a run goes on after a stop.
 """
 
 import argparse
@@ -54,7 +54,7 @@ def work(coordinator: str, count: int, index: int, threads: int, command: list[s
     out = Path(command[place])
     with tempfile.TemporaryDirectory() as spare:
         copy = Path(spare) / "out"
-        if "--resume" in command and out.is_dir():
+        if out.is_dir():
             shutil.copytree(out, copy, ignore=shutil.ignore_patterns(".*.part"))
         sys.stdout = sys.stderr = open(os.devnull, "w")  # noqa: SIM115
         sys.exit(cli.main([*command[:place], str(copy), *command[place + 1 :]]))
@@ -91,7 +91,7 @@ def _blame(children: list[subprocess.Popen], first: int) -> int:
     cause = f"was killed by {signal.Signals(-code).name}" if code < 0 else f"ended with status {code}"
     print(
         f"error: process {first + index} {cause}; the others were ended. What was finished is kept: "
-        "give the same command with --resume",
+        "give the same command again",
         file=sys.stderr,
     )
     return 1

@@ -29,7 +29,7 @@ def test_it_runs_and_finds_the_cable(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(nnap_em, "design", partial(nnap_em.design, effort=SMALL))
     matplotlib.use("agg")
     names = {"__name__": "tour"}
-    with keeping(Journal(tmp_path / "steps", {})):  # the search begins with the fit of the cell before
+    with keeping(Journal(tmp_path / "steps")):  # the search begins with the fit of the cell before
         for kind, text in _cells():
             if kind == "code":
                 exec(compile(text, str(TOUR), "exec"), names)

@@ -111,7 +111,7 @@ def test_other_numbers_are_no_other_program(cache, work, monkeypatch):
 
 def test_another_text_of_the_package_makes_another(cache, work, monkeypatch):
     _done(work, monkeypatch)
-    monkeypatch.setattr(traced, "_surroundings", lambda: "after an edit")
+    monkeypatch.setattr(traced, "surroundings", lambda: "after an edit")
     _done(work, monkeypatch)
     assert len(_kept(cache)) == 2
 

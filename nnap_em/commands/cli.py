@@ -120,7 +120,6 @@ def parser() -> argparse.ArgumentParser:
     _file(design, "--logs", "FOLDER", "of the fit, where they were moved", **several)
     for fits in (identify, diagnose, design):
         fits.add_argument("--seed", type=_natural, default=0, help="of all random numbers (0)")
-        fits.add_argument("--resume", action="store_true", help="go on from what OUT/unfinished keeps")
         fits.add_argument("--quiet", action="store_true", help="no lines of progress")
         fits.add_argument("--profile", action="store_true", help="print the seconds of stages and programs")
 

@@ -1,14 +1,12 @@
 """Common parts of the commands: set-up, data sets, model files, and runs that go on after a stop."""
 
 import argparse
-import dataclasses
 import hashlib
 import os
 import platform
-import shlex
 import tempfile
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import NamedTuple
@@ -54,8 +52,6 @@ MISFIT_STATUS = 3
 """Exit status of a fit that does not describe the motion."""
 UNFINISHED = "unfinished"
 """Folder of the finished steps of a run that is not."""
-OPTIONS = ("start", "smoother", "particles", "for", "seconds", "sequences", "seed")
-"""Those that decide the numbers."""
 
 
 def set_up() -> None:
@@ -242,26 +238,15 @@ def remove_reports(out: Path) -> None:
 
 @contextmanager
 def resumable(args: argparse.Namespace, bench: Bench, log: Log) -> Iterator[Journal]:
-    """Keep every finished step of what is done inside until all of it is; with --resume go on from what is kept.
+    """Keep every finished step of what is done inside until all of it is, and do none again that was kept.
 
     A journal that is left `open` is kept after the end, too.
-
-    Raises StoreError, before anything is touched, where that is of another rig, of other logs or of other options.
     """
-    same = _options(args, *OPTIONS, none=True)
-    same = {name: str(value) if isinstance(value, Path) else value for name, value in same.items()}
-    rig = dataclasses.asdict(bench.rig) | {"file": ""}
-    of = {"rig.toml": rig, "training data": fingerprint(bench.train.data), **same}
-    journal = Journal(args.out / UNFINISHED, of)
-    if args.resume:
-        journal.check()
-        message = f"resumed with {counted(len(journal), 'finished step')}"
-        log(message if len(journal) else f"nothing to go on from in {args.out}: begins at the start")
-    with _folder(args.out), _reporting(lambda: go_on(args, journal)):
-        if args.resume:
-            sweep(journal.folder)
-        else:
-            journal.clear()
+    journal = Journal(args.out / UNFINISHED)
+    with _folder(args.out), _reporting(journal):
+        sweep(journal.folder)
+        if len(journal):
+            log(f"{counted(len(journal), 'finished step')} in {journal.folder}: those of this run are not done again")
         count, rows = bench.train.data.valid.shape
         log(f"compiling for {counted(count, 'sequence')} of {rows} rows (the first time takes longest) ...")
         with keeping(journal):
@@ -270,36 +255,23 @@ def resumable(args: argparse.Namespace, bench: Bench, log: Log) -> Iterator[Jour
             journal.clear()
 
 
-def _options(args: argparse.Namespace, *names: str, none: bool = False) -> dict[str, object]:
-    """Those of these options that the command has; `none`: also where they were left out."""
-    flag = {"start": "from"}
-    options = {f"--{flag.get(name, name)}": getattr(args, name) for name in names if hasattr(args, name)}
-    return {name: value for name, value in options.items() if none or value is not None}
-
-
-def go_on(args: argparse.Namespace, journal: Journal) -> str:
-    """The finished steps that are kept, and the command that goes on from them."""
+def go_on(journal: Journal) -> str:
+    """The finished steps that are kept, and how to go on from them."""
     if not len(journal):
         return "stopped before the end of the first step; nothing was kept"
-    command = ["nnap-em", args.command, str(args.folder), "--out", str(args.out)]
-    for name, value in _options(args, *OPTIONS, "epochs", "more", "logs").items():
-        for one in value if isinstance(value, list) else [value]:
-            command += [name, str(one)]
-    command += ["--trust-readings"] * args.trust_readings
-    kept = counted(len(journal), "finished step")
-    return f"stopped with {kept} kept; to go on: {shlex.join([*command, '--resume'])}"
+    return f"stopped with {counted(len(journal), 'finished step')} kept; the same command goes on"
 
 
 @contextmanager
-def _reporting(message: Callable[[], str]) -> Iterator[None]:
+def _reporting(journal: Journal) -> Iterator[None]:
     """Report the finished steps where a run is stopped or a file cannot be written."""
     try:
         yield
     except KeyboardInterrupt:
-        raise KeyboardInterrupt(message()) from None
+        raise KeyboardInterrupt(go_on(journal)) from None
     except OSError as error:
         file = f"{error.filename}: " if error.filename else ""
-        raise Halted(f"{file}{error.strerror or error}; {message()}") from error
+        raise Halted(f"{file}{error.strerror or error}; {go_on(journal)}") from error
 
 
 @contextmanager

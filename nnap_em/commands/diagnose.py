@@ -3,12 +3,12 @@
 examples:
   nnap-em diagnose bench --out found
   nnap-em diagnose february --from fit --out changed  what changed since a fit: a law, a number, or nothing
-  nnap-em diagnose bench --out found --minutes 5    answer after about that time; --resume goes on
-  nnap-em diagnose bench --out found --resume       go on after Ctrl-C, with the same numbers as without it
+  nnap-em diagnose bench --out found --minutes 5    answer after about that time; the same once more goes on
 
 Fits the declared unknowns, finds what the model lacks, adds it and fits again.  OUT gets report.html (read this one),
 report.json, before.npz and after.npz (for nnap-em predict and smooth) and friction tables of both.
-test/ serves for the reported errors only.  Exit status 3 where even the last model does not describe the motion.
+test/ serves for the reported errors only.  After Ctrl-C the same command goes on, with the same numbers.  Exit status
+3 where even the last model does not describe the motion.
 """
 
 import argparse
@@ -71,7 +71,7 @@ def run(args: argparse.Namespace, log: Log) -> int:
             args.out, diagnosis, accepted, bench.train, bench.test, seed=args.seed, began=began, log=report
         )
     if journal.open:
-        log(go_on(args, journal))
+        log(go_on(journal))
     return 0 if described else MISFIT_STATUS
 
 

@@ -4,10 +4,10 @@ examples:
   nnap-em identify bench --out fit
   nnap-em identify bench --out fit --smoother particle --particles 1000 --epochs 30
   nnap-em identify february --from fit --out fit2   its posterior is the prior of these logs
-  nnap-em identify bench --out fit --resume         go on after Ctrl-C, with the same numbers as without it
 
 OUT gets model.npz, report.html, report.json, friction.csv (joint,velocity,torque,torque_std) and friction.png.
-test/ serves for the reported prediction error only, never for the fit.  Exit status 3 where the fit does not describe
+test/ serves for the reported prediction error only, never for the fit.  After Ctrl-C the same command goes on, with the
+same numbers.  Exit status 3 where the fit does not describe
 the motion: the first sentence of the report gives the reason.
 """
 

@@ -183,7 +183,7 @@ def em_step(
 
     Each is compiled by itself: what does not depend on the structure of the model is compiled once for all. While the
     horizon is `growing`, no sequence is smoothed a second time: the noise is still so large that all are wide.
-    `step` keeps the result in the journal of a command, from which `--resume` continues; elsewhere it does nothing.
+    `step` keeps the result in the journal of a command, from which it goes on after a stop; elsewhere it does nothing.
     """
     posterior = _alone(model, data, smoother, key=key) if growing else e_step(model, data, smoother, key=key, kept=kept)
     model, info = m_step(model, posterior, data)

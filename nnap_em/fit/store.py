@@ -78,7 +78,7 @@ def save(
     Args:
         path: the file, an npz.
         fitted: the fit.
-        fingerprint: digest of its training data, for `--resume`.
+        fingerprint: digest of its training data.
         notes: whatever else should be kept, as JSON.
 
     Raises:

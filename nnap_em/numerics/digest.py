@@ -1,8 +1,11 @@
 """Digest of a tree, in every process alike: numbers to the last bit, types and functions by name."""
 
 import dataclasses
+import functools
 import hashlib
+import importlib.metadata
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any, TypeGuard
 
 import jax
@@ -66,4 +69,16 @@ def digest(*trees: Any, name: Callable[[Any], str] = full_name) -> str:
             raise TypeError(f"{full_name(type(node))} cannot be distinguished from another of its kind")
 
     walk(trees)
+    return sha256.hexdigest()
+
+
+@functools.cache
+def surroundings() -> str:
+    """The package's text, what it stands on and how JAX is set, as one number."""
+    package, sha256 = Path(__file__).resolve().parents[1], hashlib.sha256()
+    for path in sorted(package.rglob("*.py")):
+        sha256.update(str(path.relative_to(package)).encode() + path.read_bytes())
+    stands_on = ("jax", "jaxlib", "equinox", "diffrax", "numpy")
+    versions = [f"{name} {importlib.metadata.version(name)}" for name in stands_on]
+    sha256.update(repr((versions, jax.default_backend(), jax.config.read("jax_enable_x64"))).encode())
     return sha256.hexdigest()

@@ -7,14 +7,10 @@ their arrays.  What else could decide it, such as an effect of a user's own, is 
 kept.
 """
 
-import functools
-import hashlib
-import importlib.metadata
 import json
 import logging
 import sys
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import equinox as eqx
@@ -22,7 +18,7 @@ import jax
 from jax.core import Tracer
 from jax.sharding import Mesh
 
-from .digest import digest, full_name
+from .digest import digest, full_name, surroundings
 
 
 @runtime_checkable
@@ -150,7 +146,7 @@ def _shape(a: jax.Array) -> tuple[str, bool]:
 def _key(function: Callable, arrays: list[jax.Array], static: Any) -> str:
     """Key of a program; TypeError where something may decide it that is not described whole."""
     mesh = lambda leaf: f"{leaf.axis_names} {leaf.devices.shape}" if isinstance(leaf, Mesh) else leaf  # noqa: E731
-    return digest(_surroundings(), function, list(map(_shape, arrays)), jax.tree.map(mesh, static), name=_name)
+    return digest(surroundings(), function, list(map(_shape, arrays)), jax.tree.map(mesh, static), name=_name)
 
 
 def _name(code: Any) -> str:
@@ -161,15 +157,3 @@ def _name(code: Any) -> str:
     if package not in packages or ("<" in code.__qualname__ and getattr(code, "__closure__", ()) is not None):
         raise TypeError(f"it holds {full_name(code)}")
     return f"{full_name(code)} {lines and lines.co_firstlineno}"
-
-
-@functools.cache
-def _surroundings() -> str:
-    """The package's text, what it stands on and how JAX is set, as one number."""
-    package, sha256 = Path(__file__).resolve().parents[1], hashlib.sha256()
-    for path in sorted(package.rglob("*.py")):
-        sha256.update(str(path.relative_to(package)).encode() + path.read_bytes())
-    stands_on = ("jax", "jaxlib", "equinox", "diffrax", "numpy")
-    versions = [f"{name} {importlib.metadata.version(name)}" for name in stands_on]
-    sha256.update(repr((versions, jax.default_backend(), jax.config.read("jax_enable_x64"))).encode())
-    return sha256.hexdigest()

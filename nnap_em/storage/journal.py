@@ -1,36 +1,32 @@
 """Finished steps of a long computation on disk, so that one that was killed goes on where it was.
 
-    with keeping(Journal(folder, {"seed": 0})):
+    with keeping(Journal(folder)):
         closed = diagnose(rig, data, key=key)
 
 A step is a function that gives the same for the same arguments, and a file holds the outcome of one call.  It is found
-again by a digest of all that the function was given: a resumed run computes what is not there, and a step whose
-arguments differ in one bit is computed anew.  Outside `keeping` nothing of this happens.  After a deadline
+again by a digest of all that the function was given, and of the package and what it stands on: what is not there, is
+damaged, or differs in one bit, is computed anew.  Outside `keeping` nothing of this happens.  After a deadline
 (`deadline.py`) no new step begins.
 """
 
 import contextlib
 import contextvars
 import functools
-import json
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, TypeVar
 
 import jax
-import numpy as np
 
-from .. import __version__
-from ..numerics.digest import digest
+from ..numerics.digest import digest, surroundings
 from ..numerics.parallel import everywhere
 from ..numerics.profile import stage
 from .deadline import in_time
-from .files import Kind, read_arrays, refuse, sweep, write_arrays
+from .files import Kind, StoreError, read_arrays, sweep, write_arrays
 from .leaves import describe, name_of, restore
 
-_AGAIN = "remove it, and --resume does this step again; or leave --resume out to begin anew"
-STEP_KIND = Kind("nnap_em finished step", 1, "finished step", _AGAIN, _AGAIN, _AGAIN, _AGAIN)
+STEP_KIND = Kind("nnap_em finished step", 2, "finished step", *4 * ["remove it"])
 HERE: Any = object()
 """Stands for one array or number in the form of an outcome."""
 
@@ -39,23 +35,16 @@ _Step = TypeVar("_Step", bound=Callable)
 
 
 class Journal:
-    """A folder of finished steps; `of` names, as JSON, the computation to which they belong."""
+    """A folder of finished steps."""
 
-    def __init__(self, folder: Path, of: Mapping[str, Any]):
+    def __init__(self, folder: Path):
         self.folder = folder
         self.open = False
         """True for a computation that was not finished in its time, and is to be continued."""
-        self.of = json.loads(json.dumps(dict(of)))
-        self.by = {"nnap_em": __version__, "jax": jax.__version__}
 
     def __len__(self) -> int:
         """Number of finished steps."""
         return sum(1 for _ in self.folder.glob("*.npz"))
-
-    def check(self) -> None:
-        """Raises StoreError, with its name, for a file that is no finished step of this computation."""
-        for path in sorted(self.folder.glob("*.npz")):
-            self._read(path)
 
     def clear(self) -> None:
         """Remove the finished steps, and the folder if nothing else is in it."""
@@ -69,13 +58,12 @@ class Journal:
 
     def find(self, name: str, form: Any) -> Any:
         """The outcome kept under `name`, of the structure of `form`; None if there is none."""
-        path = self.folder / f"{name}.npz"
-        if not path.exists():
+        try:
+            header, arrays = read_arrays(self.folder / f"{name}.npz", STEP_KIND)
+        except StoreError:  # none, or damaged
             return None
-        entries, arrays = self._read(path)
+        entries = header["leaves"]
         blanks, structure = jax.tree.flatten(form)
-        if len(entries) != len(blanks):
-            refuse(path, f"{len(entries)} numbers and arrays, not {len(blanks)}", _AGAIN)
         leaves = enumerate(zip(entries, blanks, strict=True))
         return jax.tree.unflatten(structure, [restore(e, arrays.get(str(i)), blank) for i, (e, blank) in leaves])
 
@@ -83,23 +71,8 @@ class Journal:
         """Write an outcome."""
         leaves = [describe(leaf) for leaf in jax.tree.leaves(outcome)]
         arrays = {str(i): array for i, (_, array) in enumerate(leaves) if array is not None}
-        header = {"of": self.of, "by": self.by, "leaves": [entry for entry, _ in leaves]}
+        header = {"leaves": [entry for entry, _ in leaves]}
         write_arrays(self.folder / f"{name}.npz", STEP_KIND, header, arrays)
-
-    def _read(self, path: Path) -> tuple[list[dict[str, Any]], dict[str, np.ndarray]]:
-        header, arrays = read_arrays(path, STEP_KIND)
-        by, of = header.get("by"), header.get("of")
-        if by != self.by:
-            origin, this = (" and ".join(f"{k} {v}" for k, v in (d or {}).items()) for d in (by, self.by))
-            refuse(path, f"made by {origin}, this is {this}", "leave --resume out to begin anew")
-        for name, value in self.of.items():
-            if (other := (of or {}).get(name)) != value:
-                option = isinstance(value, int) or name.startswith("--")
-                origin = f"with {name} {other}, not {value}" if option else f"from another {name}"
-                again = f"resume with {name} {other}" if other is not None else f"resume without {name}"
-                hint = f"{again}, or begin anew" if option else "leave --resume out to begin anew"
-                refuse(path, f"made {origin}", f"{hint}, or give another --out")
-        return header["leaves"], arrays
 
 
 @contextlib.contextmanager
@@ -123,7 +96,7 @@ def step(form: Callable[..., Any]) -> Callable[[_Step], _Step]:
             if journal is None:
                 in_time()
                 return function(*args, **options)
-            name = f"{name_of(function)}-{digest(name_of(function), args, options)[:32]}"
+            name = f"{name_of(function)}-{digest(surroundings(), name_of(function), args, options)[:32]}"
             outcome = journal.find(name, form(*args, **options))
             if everywhere(outcome is not None):
                 return outcome

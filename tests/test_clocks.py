@@ -72,11 +72,9 @@ def _changed(rows, values):
 
 WRONG = {  # stamps [s], the rows that are left out, and the sequences
     "zeros before the clock was set": (_changed(slice(10), 0.0), range(10), [990]),
-    "a clock that stands at 0 for long": (_changed(slice(300), 0.0), range(300), [700]),
+    "a clock that stands at 0 for long": (_changed(slice(300), 0.0), range(299), [700]),
     "one stamp of 2106": (_changed(500, 2.0**32), [500], [1000]),
     "the last one of 2106": (_changed(999, 2.0**32), [999], [999]),
-    "one stamp 100 s late": (_changed(500, 1.7e9 + 105), [500], [1000]),
-    "one stamp 5 s early": (_changed(700, 1.7e9 + 2), [700], [1000]),
     "zeros in the middle": (_changed(slice(500, 550), 0.0), range(500, 550), [500, 450]),
     "a number beyond all times": (_changed(500, 1e30), [500], [1000]),
     "a pause of three days": (1.7e9 + T + 3 * DAY * (T >= 5), [], [500, 500]),
@@ -99,17 +97,15 @@ def test_stamps_of_another_clock_are_left_out_and_memory_follows_the_samples(tmp
 
 
 EDGES = {  # times [s] and the number that is used; None: refused
-    "5 % of the times": (np.r_[T[:50] + 20, T[50:] - 5], 950),
-    "more than 5 %": (np.r_[T[:51] + 20, T[51:] - 5], None),
-    "49 times before 31 days": (np.r_[T[:49], T[49:] + 31 * DAY], 951),
-    "50 times before 31 days": (np.r_[T[:50], T[50:] + 31 * DAY], 1000),
-    "49 times before 29 days": (np.r_[T[:49], T[49:] + 29 * DAY], 1000),
+    "5 % of the times": (np.r_[T[:950], T[950:] + 2 * DAY], 950),
+    "more than 5 %": (np.r_[T[:949], T[949:] + 2 * DAY], 1000),
+    "a late one within a day": (np.r_[T[:1], T[1:] + 0.9 * DAY], 1000),
+    "a late one": (np.r_[T[:1], T[1:] + 1.1 * DAY], 999),
     "0.9 s back": (T - 0.9 * (T > 9.955), 1000),
-    "1.1 s back": (T - 1.1 * (T > 9.955), 996),
-    "1.1 s back for long": (T - 1.1 * (T > 5), None),
+    "1.1 s back": (T - 1.1 * (T > 9.955), None),
+    "a time 5 s early": (T - 5 * (np.arange(1000) == 700), None),
     "backwards in small steps": (T[::-1], None),
-    "one of two": (np.array([0.0, 1.7e9]), 2),
-    "one of three": (np.array([0.0, 1.7e9, 1.7e9 + 1]), 2),
+    "one of three": (np.array([0.0, 1.7e9, 1.7e9 + 1]), 3),
 }
 
 
@@ -117,15 +113,6 @@ EDGES = {  # times [s] and the number that is used; None: refused
 def test_which_times_are_of_one_clock(t, count):
     kept = clock.trusted(np.round(t * NS).astype(np.int64))
     assert (None if kept is None else kept.size) == count
-
-
-def test_more_wrong_stretches_than_are_looked_at_are_refused():
-    """Every wrong time is a stretch, and what follows it another."""
-    for wrong, dropped in ((clock.RUNS // 2 - 1, clock.RUNS // 2 - 1), (clock.RUNS // 2, None)):
-        t = np.arange(50_000) * NS // 100
-        t[np.arange(1, wrong + 1) * 20] += 10**6 * NS
-        kept = clock.trusted(t)
-        assert (None if kept is None else t.size - kept.size) == dropped
 
 
 def test_small_steps_back_in_a_table_are_sorted_and_larger_ones_refused(tmp_path):

@@ -14,8 +14,6 @@ from .recording import SECOND, Lag, Track, refuse
 
 BACK = 1.0
 """Seconds that a log may be out of order: writers of several threads are, a clock that was set back is more."""
-RUNS = 4096
-"""Stretches in which a clock does not step by more than `BACK`, above which wrong times are not looked for."""
 
 
 class Clock(NamedTuple):
@@ -69,7 +67,7 @@ def rising(path: Path, where: str, t: Int[np.ndarray, " m"], name: str, noun: st
     kept = trusted(t)
     if kept is None:
         k = int(np.argmin(np.diff(t)))
-        hint = "the clock was set back there: cut the file at that place"
+        hint = "the clock was set back there: cut the file at that place, or take out a row with a wrong time"
         amount = float(t[: k + 1].max() - t[k + 1]) * 1e-9
         refuse(path, where, f"time runs backwards at {noun} {k + 2}, by {amount:.6g} s", hint)
     if t.size > 1 and t[kept].min() == t[kept].max():
@@ -120,34 +118,13 @@ def in_a_row(t: Int[np.ndarray, " row"], episode: Float[np.ndarray, " row"]) -> 
 
 
 def trusted(t: Int[np.ndarray, " message"]) -> Int[np.ndarray, " kept"] | None:
-    """Messages whose times [ns] are of one clock that goes on; None where it was set in the middle of the log.
+    """Messages whose times [ns] are of one clock that goes on; None where it was set back in the middle of the log.
 
-    Times are wrong if they go back by more than `BACK` from, or on to, those of the most messages, or if they are few
-    and lie 30 days from the others: zeros before a clock was set, a wild stamp.
+    Few times far from the others are those of a clock that was not set: zeros, a wild stamp.
     """
-    steps = np.diff(t)
-    first = np.append(0, np.flatnonzero((steps > BACK * SECOND) | (steps < -BACK * SECOND)) + 1)
-    back = _behind(t) > BACK * SECOND
-    if first.size == 1 or (back and first.size > RUNS):
-        return None if back else np.arange(t.size)
-    rises = np.append(True, steps > 0)
-    rises[first] = True  # a clock that stands is no evidence
-    weight = np.add.reduceat(rises.astype(int), first)
-    low, high = np.minimum.reduceat(t, first), np.maximum.reduceat(t, first)
-    chain = _longest(low, high, weight) if back else np.arange(first.size)
-    # Largest share of the times that may be wrong: a clock of which more are wrong was set in the middle of the log
-    budget = max(0.05 * weight.sum(), 1)
-    if weight.sum() - weight[chain].sum() > budget:
-        return None
-    # Silence [s] that no log has: what is beyond, if it is little, has stamps of a clock that was not set
-    groups = np.cumsum(np.append(0, low[chain][1:] - high[chain][:-1] > 30 * 86400.0 * SECOND))
-    size = np.bincount(groups, weight[chain])
-    few = (size < 50) & (size <= budget)  # wrong times beyond a silence at most: as many rows as a sequence needs
-    if few.any() and not few.all() and size[few].sum() <= budget:
-        chain = chain[~few[groups]]
-    keep = np.zeros(first.size, bool)
-    keep[chain] = True
-    kept = np.flatnonzero(np.repeat(keep, np.diff(np.append(first, t.size))))
+    far = np.abs(t - np.median(t)) > 86400.0 * SECOND
+    few = 0.05  # share of the times that may be wrong: a clock of which more are wrong was set in the middle of the log
+    kept = np.flatnonzero(~far) if far.mean() <= few else np.arange(t.size)
     return kept if _behind(t[kept]) <= BACK * SECOND else None
 
 
@@ -184,22 +161,6 @@ def _clock(t: Int[np.ndarray, " m"], order: Int[np.ndarray, " used"], name: str,
 def _behind(t: Int[np.ndarray, " message"]) -> int:
     """Largest amount by which a time is behind an earlier one [ns]."""
     return 0 if (t[1:] >= t[:-1]).all() else int(np.max(np.maximum.accumulate(t) - t))
-
-
-def _longest(
-    low: Int[np.ndarray, " run"], high: Int[np.ndarray, " run"], weight: Int[np.ndarray, " run"]
-) -> np.ndarray:
-    """The runs, one after the other in time as in the file, that have the most messages."""
-    best, before = weight.copy(), np.full(low.size, -1)
-    for k in range(1, low.size):
-        possible = np.where(high[:k] - low[k] <= BACK * SECOND, best[:k], 0)
-        i = int(np.argmax(possible))
-        if possible[i]:
-            best[k], before[k] = best[k] + possible[i], i
-    chain = [int(np.argmax(best))]
-    while before[chain[-1]] >= 0:
-        chain.append(int(before[chain[-1]]))
-    return np.array(chain[::-1])
 
 
 def _odd(stamp: Int[np.ndarray, " message"], log: Int[np.ndarray, " message"]) -> str | None:

@@ -19,9 +19,8 @@ import numpy as np
 from nnap_em import friction_table, identify, read_logs, read_rig
 from nnap_em.commands.cli import main as nnap_em
 from nnap_em.commands.common import MISFIT_STATUS
-from nnap_em.diagnosis.interventions import WINDOWS, averaged
+from nnap_em.diagnosis.interventions import WINDOWS, averaged, interventions
 from nnap_em.diagnosis.residual import residual
-from nnap_em.diagnosis.undisturbed import disturbance_free
 
 ROOT = Path(__file__).resolve().parents[1]
 MEASURED = ROOT.parent / "shared" / "data" / "measured"
@@ -103,8 +102,8 @@ def touch(out: Path) -> Arrays:
     folder = _recordings("dfki_c1_hidden_pert")
     rig = read_rig(folder / "rig.toml")
     logs = read_logs(folder / "train", rig)
-    fit = lambda data: identify(rig, data, key=jax.random.key(0))  # noqa: E731
-    fitted, _, disturbances, _ = disturbance_free(fit, fit(logs.data), logs.data)
+    fitted = identify(rig, logs.data, key=jax.random.key(0))
+    disturbances = interventions(fitted, logs.data)
     force = residual(fitted, logs.data).force
     count = [sum(each.sequence == i for each in disturbances) for i in range(len(logs.files))]
     number = int(np.argmax(count))

@@ -5,11 +5,9 @@ import json
 import numpy as np
 import pytest
 
-from nnap_em.data.dataset import Dataset
 from nnap_em.data.rig import read_rig
 from nnap_em.diagnosis.interventions import Intervention, disturbances
 from nnap_em.diagnosis.residual import Names, Residual
-from nnap_em.diagnosis.undisturbed import without
 from nnap_em.report.diagnosis import _disturbance
 from nnap_em.report.page import page
 from nnap_em.report.tables import json_text
@@ -81,23 +79,6 @@ def test_padding_and_what_is_too_small_to_matter():
     assert disturbances(left, NAMES, DT, np.asarray([5.0])) == ()
 
 
-@pytest.mark.parametrize("restart", [True, False])
-def test_a_recording_is_cut_at_a_touch(restart):
-    """Rows of the touch and 0.1 s about it are in no sequence; all others are where their readings say."""
-    t = np.tile(DT * np.arange(301), (2, 1))
-    data = Dataset(t, t[..., None], np.stack([t, -t], axis=-1), t < 9)
-    cut, pieces = without(data, (TOUCH,), DT, restart=restart)
-    assert pieces == ((0, 1, 1) if restart else (0, 1))
-    lengths = np.asarray(cut.valid).sum(axis=1).tolist()
-    assert lengths == ([301, 110, 140] if restart else [301, 110])
-    kept = [np.round(t[v] / DT).astype(int).tolist() for t, v in zip(cut.t, cut.valid, strict=True)]
-    assert kept[:2] == [list(range(301)), list(range(110))]
-    assert kept[2:] == ([list(range(161, 301))] if restart else [])
-    y, t, valid = (np.asarray(a) for a in (cut.y, cut.t, cut.valid))
-    np.testing.assert_array_equal(y[valid], np.stack([t, -t], axis=-1)[valid])
-    assert np.isnan(y[~valid]).all() and (np.asarray(cut.u)[~valid] == 0).all()
-
-
 def test_report_and_page_name_the_file(tmp_path):
     entry = _disturbance(TOUCH, ("a.csv", "b.csv"))
     (tmp_path / "report.json").write_text(json_text({"interventions": [entry]}))
@@ -110,6 +91,6 @@ def test_report_and_page_name_the_file(tmp_path):
 
 
 def test_the_shared_rig_declares_what_a_touch_needs(shared):
-    """Every coordinate is measured, and no start is declared: recordings can be cut."""
+    """Every coordinate is measured."""
     rig = read_rig(shared / "data/measured/dfki_c1_hidden_pert/rig.toml", specs)
-    assert {"theta1", "theta2"} <= set(rig.measured) and not rig.start
+    assert {"theta1", "theta2"} <= set(rig.measured)

@@ -314,18 +314,18 @@ def test_a_named_law_gives_way_to_a_remainder_that_explains_the_larger_part(remo
 
 
 @pytest.mark.parametrize(
-    ("certain", "pieces", "white", "stays"),
+    ("certain", "count", "white", "stays"),
     [
-        (2.1, (), True, True),
-        (1.9, (), True, False),
-        (2.7, (), False, True),  # six recordings: Student's t of five degrees of freedom
-        (2.6, (), False, False),
-        (14.1, (0, 0, 0, 1, 1, 1), False, True),  # two
-        (13.9, (0, 0, 0, 1, 1, 1), False, False),
-        (13.9, (0, 0, 0, 1, 1, 1), True, True),
+        (2.1, 6, True, True),
+        (1.9, 6, True, False),
+        (2.7, 6, False, True),  # six recordings: Student's t of five degrees of freedom
+        (2.6, 6, False, False),
+        (14.1, 2, False, True),
+        (13.9, 2, False, False),
+        (13.9, 2, True, True),
     ],
 )
-def test_a_law_that_is_not_determined_as_it_is_stated_is_a_suspect(monkeypatch, certain, pieces, white, stays):
+def test_a_law_that_is_not_determined_as_it_is_stated_is_a_suspect(monkeypatch, certain, count, white, stays):
     """The gain is 1, of so many standard deviations as stated; the dead zone of 20 is sure."""
     names = ["motor_gain", "dead_zone"] if stays else ["dead_zone"]
     hypothesis = _with("motor_gain", "dead_zone")
@@ -344,7 +344,7 @@ def test_a_law_that_is_not_determined_as_it_is_stated_is_a_suspect(monkeypatch, 
     )
     rounds = [Step(9, (), (), key_of(effect), 2) for effect in hypothesis.model.effects]
     state, log = _emstate(hypothesis.model, 1.0), []
-    context = _context()._replace(log=log.append, pieces=pieces, white=white)
+    context = _context()._replace(log=log.append, white=white, data=Dataset(*(part[:count] for part in DATA)))
     left, outcome, steps = search._determined(context, hypothesis, state, rounds, lambda fitted, data: fitted)
     assert _names(left.model) == _names(outcome.model) == names
     dropped = key_of(hypothesis.model.effects[0])
@@ -368,15 +368,11 @@ def test_a_search_begins_at_the_whole_length_unless_most_sequences_are_lost_ther
 
 @pytest.mark.parametrize("white", [True, False])
 def test_external_disturbances_are_sought_where_noise_is_not_what_the_model_says(monkeypatch, white):
-    cut = []
+    sought = []
 
     def run(context, hypothesis, state, lengths):
         hypothesis = _with("motor_gain")
         return search._Searched(hypothesis, _emstate(hypothesis.model, 1.0), [])
-
-    def disturbance_free(fit, fitted, data):
-        cut.append(data)
-        return fitted, data, (), ()
 
     def identify(rig, data, *, key, smoother, watch):
         before = _context().before
@@ -388,17 +384,18 @@ def test_external_disturbances_are_sought_where_noise_is_not_what_the_model_says
         identify=identify,
         _search=run,
         quantised=lambda context, hypothesis: (hypothesis, None),
-        white_readings=lambda data, _: white or bool(cut),
+        white_readings=lambda data, _: white,
         covariances=lambda model, rule, hessian: [np.eye(1)] * len(model.effects),
         finished=lambda fitted, data: fitted,
         _released=lambda rig: search.finished,
         begin=lambda rig, data, key: _context().before,
-        disturbance_free=disturbance_free,
+        interventions=lambda fitted, data: sought.append(fitted.model) or ("push",),
     )
     outcome = search.diagnose(RIG, DATA, key=jax.random.key(0))
     assert len(outcome.evidence) == 1 and outcome.complete
     assert outcome.before.smoother.second() is not None and outcome.after.smoother.second() is not None
-    assert bool(cut) != white
+    assert outcome.interventions == (() if white else ("push",))
+    assert sought == ([] if white else [outcome.after.model])  # by the model with its laws
 
 
 @pytest.mark.parametrize(("channel", "left", "stays"), [("dx", 0.91, False), ("dx", 0.90, True), ("x", 0.1, False)])

@@ -61,8 +61,6 @@ class SearchContext(NamedTuple):
     loss: MultiStep
     effort: Effort
     log: Log
-    pieces: tuple[int, ...] = ()
-    """Recording that every sequence is a piece of; empty: each is a recording."""
     until: float = math.inf
     """Moment of `time.monotonic()` after which no new round or refit begins."""
     origin: SmoothedFit | None = None
@@ -107,7 +105,7 @@ def smooth(context: SearchContext, hypothesis: Hypothesis, length: int) -> tuple
     posterior = e_step(hypothesis.model, every, smoother, key=before.state.key)
     whole = np.asarray(not_diverged(posterior, every))
     both = _cut((posterior.state, every), length, context.longest)
-    fit = SmoothedFit(context.declared, hypothesis, *both, whole, context.longest, context.pieces)
+    fit = SmoothedFit(context.declared, hypothesis, *both, whole, context.longest)
     if whole.all():
         return fit, whole
     dof = len(hypothesis.model.system.coordinates)

@@ -16,16 +16,11 @@ QUARTERS = 4
 """Parts of each motion, where there are fewer than three motions."""
 
 
-def motions(
-    state: Float[np.ndarray, "seq time state"], used: Bool[np.ndarray, " seq"], recording: Int[np.ndarray, " seq"]
-) -> Int[np.ndarray, " seq"]:
-    """Number of the motion of every sequence.
-
-    Recordings that repeat a motion are no evidence of each other and share its number; so do the pieces of a recording.
-    """
+def motions(state: Float[np.ndarray, "seq time state"], used: Bool[np.ndarray, " seq"]) -> Int[np.ndarray, " seq"]:
+    """Number of the motion of every sequence; those that repeat a motion are no evidence of each other and share it."""
     size = np.nanmean(state[used] ** 2, axis=(0, 1)) + 1e-12
     scaled = state / np.sqrt(size)
-    motion = recording.copy()
+    motion = np.arange(len(state))
     for i, j in itertools.combinations(np.flatnonzero(used), 2):
         known = np.isfinite(scaled[[i, j]]).all(axis=-1)
         both = known.all(axis=0)
@@ -37,12 +32,10 @@ def motions(
     return motion
 
 
-def times(
-    clock: Float[np.ndarray, "seq time"], data: Dataset, recording: Int[np.ndarray, " seq"], count: int
-) -> Int[np.ndarray, "seq time"]:
-    """Part, of `count` equal ones, of its recording that each moment of `clock` [s] lies in."""
+def times(clock: Float[np.ndarray, "seq time"], data: Dataset, count: int) -> Int[np.ndarray, "seq time"]:
+    """Part, of `count` equal ones, of its sequence that each moment of `clock` [s] lies in."""
     t = np.where(np.asarray(data.valid), np.asarray(data.t), np.nan)
-    low, high = (np.array([of(t[recording == r]) for r in recording])[:, None] for of in (np.nanmin, np.nanmax))
+    low, high = (of(t, axis=1, keepdims=True) for of in (np.nanmin, np.nanmax))
     return np.clip((count * (clock - low) / (high - low + 1e-12)).astype(int), 0, count - 1)
 
 
@@ -65,12 +58,11 @@ def parts(
     path: Gaussian,
     data: Dataset,
     used: Bool[np.ndarray, " seq"],
-    recording: Int[np.ndarray, " seq"],
     rows: Int[np.ndarray, " time"],
 ) -> tuple[Int[np.ndarray, "seq time"], Int[np.ndarray, "seq time"]]:
     """Fold and block of the moments at `rows` of every sequence."""
     state = np.where(np.asarray(data.valid)[..., None], np.asarray(path.mean), np.nan)
-    motion = motions(state[..., : 2 * len(model.system.coordinates)], used, recording)
+    motion = motions(state[..., : 2 * len(model.system.coordinates)], used)
     clock = np.asarray(data.t)[:, rows]
     time_parts = 5  # parts of time: what happens at one moment of every recording is no law
-    return fold_of(used, motion, times(clock, data, recording, QUARTERS)), times(clock, data, recording, time_parts)
+    return fold_of(used, motion, times(clock, data, QUARTERS)), times(clock, data, time_parts)

@@ -25,8 +25,6 @@ WINDOW_DISTANCE = 0.03
 """Time between the windows that are compared [s]."""
 LEVEL = 4.0
 """Smallest disturbance, in standard deviations: normal noise reaches it once in some thousand windows."""
-MORE = 0.8
-"""Share of `LEVEL` that suffices once another disturbance is certain."""
 ALONE = 2.0
 """Factor on `LEVEL` at a state that has no neighbours."""
 SMALL = 0.05

@@ -47,9 +47,7 @@ class Diagnosis(NamedTuple):
     evidence: tuple[Evidence, ...]
     steps: tuple[Step, ...]
     interventions: tuple[Intervention, ...] = ()
-    """External disturbances, whose rows are in no fit."""
-    pieces: tuple[int, ...] = ()
-    """Recording that every sequence of the fits is a piece of; empty if each is a recording."""
+    """External disturbances by the last model."""
     complete: bool = True
     """False where the search was stopped before its end: more may be missing."""
     failure: str = ""

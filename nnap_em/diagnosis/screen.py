@@ -253,7 +253,7 @@ def _bands(
 def _band(fit: SmoothedFit, candidates, precision, pull, linearised: Linearised, shifts: int) -> tuple[Shares, ...]:
     """The screen of some candidates at one band."""
     count, timed = 1 + shifts, ["time" in c.start.signals(fit.model.system) for c in candidates]
-    fold, block = parts(fit.model, fit.path, fit.data, fit.used, fit.recording, linearised.rows)
+    fold, block = parts(fit.model, fit.path, fit.data, fit.used, linearised.rows)
     rng, size = np.random.default_rng(0), spans(candidates)[-1].stop
     linearised = linearised._replace(columns=linearised.columns[..., : len(pull) + size])
     moved = [shifted(linearised, len(pull), rng).columns[..., len(pull) :] for _ in range(shifts)]

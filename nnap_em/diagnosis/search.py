@@ -23,7 +23,6 @@ from ..em.noise import white_readings
 from ..fit.identify import Identified, begin, finished, identify
 from ..fit.known import forgotten, known, unheld
 from ..model.state_space import StateSpaceModel
-from ..numerics.digits import counted
 from ..numerics.programs import release_programs
 from ..smoother.gaussian import CubatureSmoother, GaussianSmoother
 from ..smoother.start import StartBank
@@ -33,6 +32,7 @@ from .backward import backward
 from .context import SEARCH_EFFORT, SHORT, Effort, SearchContext, Stages, extend, smooth
 from .equations import search_equations
 from .hypothesis import Evidence, Hypothesis, covariances
+from .interventions import interventions
 from .keys import Key, key_of, remainder_of, replaced, words
 from .losses import MultiStep
 from .outcome import Diagnosis, Step, Suspect
@@ -40,7 +40,6 @@ from .quantised import quantised
 from .rounds import Round, screening_round
 from .smoothed import along, risen_since
 from .trial import Trial, certainty
-from .undisturbed import disturbance_free
 from .verdict import DETERMINED, FOLLOWED, HELD, Rejection, even
 
 FAILURES = (ArithmeticError, ValueError, RuntimeError)
@@ -128,7 +127,7 @@ def _determined(
     The search counts rows by their likelihood, which is surer than recordings agree; of few, the standard deviation is
     hardly known, and chance is that of Student's t [Cameron & Miller 2015, J. Human Resources 50(2), for clusters].
     """
-    others = math.inf if context.white else max(len({*context.pieces} or context.data.t) - 1, 1)
+    others = math.inf if context.white else max(len(context.data.t) - 1, 1)
     chance = stats.t.isf(stats.norm.sf(DETERMINED), others)
     while state is not None and any(hypothesis.evidence):
         outcome = release(_outcome(context.before, hypothesis, state), context.data)
@@ -247,7 +246,7 @@ def diagnose(
 ) -> Diagnosis:
     """Fit the declared unknowns of a rig, find what it lacks, add that, and fit again.
 
-    Where readings do not carry white noise, as on real machines, external disturbances are left out before.
+    Where readings do not carry white noise, as on real machines, external disturbances are reported, too.
 
     Args:
         rig: what is declared.
@@ -307,16 +306,15 @@ def diagnose(
     change = start is not None
     origin = None if start is None or own is None else along(start, own, unbranched(start.bank))
     ended = _ended(hold) if change else finished if hold == 1.0 else _released(rig)
-    before, data, disturbances, pieces = (before, data, (), ()) if white else disturbance_free(identified, before, data)
-    if disturbances:
-        log(f"{counted(len(disturbances), 'external disturbance')}: rows left out")
     risen = None if origin is None else risen_since(origin, along(before, data, before.smoother))
-    context = SearchContext(before, stages, data, MultiStep(), effort, log, pieces, end, origin, change, white, risen)
-    diagnosis = search(context, release=ended)._replace(interventions=disturbances, pieces=pieces, risen=risen)
+    context = SearchContext(before, stages, data, MultiStep(), effort, log, end, origin, change, white, risen)
+    diagnosis = search(context, release=ended)._replace(risen=risen)
     if change or not white:
         before = ended(before, data)
         after = diagnosis.after if any(diagnosis.evidence) else before
         diagnosis = diagnosis._replace(before=before, after=after, change=change)
+    if not white:
+        diagnosis = diagnosis._replace(interventions=interventions(diagnosis.after, data))
     return _branching(diagnosis)
 
 

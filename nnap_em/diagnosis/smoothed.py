@@ -5,7 +5,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Int
+from jaxtyping import Bool
 
 from ..data.dataset import Dataset
 from ..em.loop import e_step
@@ -33,8 +33,6 @@ class SmoothedFit(NamedTuple):
     """Sequences that the smoother follows."""
     rows: int
     """Rows of the whole recording, of which `data` may be a part."""
-    pieces: tuple[int, ...] = ()
-    """Recording that every sequence is a piece of; empty: each is a recording."""
 
     @property
     def model(self) -> StateSpaceModel:
@@ -45,11 +43,6 @@ class SmoothedFit(NamedTuple):
     def m_step(self) -> ScoringMStep:
         """M-step that fits it."""
         return self.hypothesis.m_step
-
-    @property
-    def recording(self) -> Int[np.ndarray, " seq"]:
-        """Number of the recording of every sequence."""
-        return np.asarray(self.pieces) if self.pieces else np.arange(len(self.data.t))
 
 
 def along(fitted: Identified, data: Dataset, smoother: AbstractSmoother) -> SmoothedFit:

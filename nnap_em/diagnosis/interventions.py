@@ -173,11 +173,11 @@ def repeated(mean: Float[np.ndarray, " place"], samples: Places, at: int, separa
 
 
 def disturbances(
-    residual: Residual, names: Names, dt: float, least: Float[np.ndarray, " dof"], bar: float = LEVEL
+    residual: Residual, names: Names, dt: float, least: Float[np.ndarray, " dof"]
 ) -> tuple[Intervention, ...]:
     """External disturbances in the missing force, in the order of recordings and times.
 
-    The geometric mean of two numbers is at least `bar` standard deviations: the size of the force, and its difference
+    The geometric mean of two numbers is at least `LEVEL` standard deviations: the size of the force, and its difference
     from the force on neighbours in state space at other moments.  `least`: smallest size for each joint [N m, or N].
     """
     known = residual.valid & residual.used[:, None] & np.isfinite(residual.state).all(axis=-1)
@@ -196,7 +196,7 @@ def disturbances(
         stds = [b.std[samples.seq, samples.row, j] for b in windows]
         sure = np.stack([_sure(m, s, samples, place, counts) for m, s in zip(means, stds, strict=True)])
         sure = np.where(np.abs(np.stack(means)) >= least[j], sure, 0.0) / np.where(counts.any(axis=1), 1.0, ALONE)
-        while sure.max() >= bar:
+        while sure.max() >= LEVEL:
             k, at = np.unravel_index(sure.argmax(), sure.shape)
             i, row, size, std = int(samples.seq[at]), int(samples.row[at]), float(means[k][at]), float(stds[k][at])
             first, last = _extent(windows[0].mean[i, :, j], row, math.copysign(1.0, size))
@@ -242,7 +242,7 @@ def _extent(mean: Float[np.ndarray, " time"], row: int, sign: float) -> tuple[in
     return int(before[-1] + 1) if before.size else 0, int(row + max(after[0] - 1, 0)) if after.size else mean.size - 1
 
 
-def interventions(fitted: Identified, data: Dataset, bar: float = LEVEL) -> tuple[Intervention, ...]:
+def interventions(fitted: Identified, data: Dataset) -> tuple[Intervention, ...]:
     """External disturbances in `data`, by the smoother of the fit; none where a coordinate is not measured.
 
     A hidden joint answers whatever pushes the others, so that the pushes cannot be located there.
@@ -251,7 +251,7 @@ def interventions(fitted: Identified, data: Dataset, bar: float = LEVEL) -> tupl
     if fitted.model.hides:
         return ()
     least = SMALL * measure_scales(rig, system, data).torque
-    return disturbances(residual(fitted, data), names_of(fitted), rig.dt, least, bar)
+    return disturbances(residual(fitted, data), names_of(fitted), rig.dt, least)
 
 
 def overlap(a: Intervention, b: Intervention) -> bool:

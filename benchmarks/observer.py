@@ -117,7 +117,7 @@ def wild_runs(fitted: Identified, steps: int, folder: Path) -> Iterator[tuple[st
         for bits in (64, 32):
             write_observer(one, folder / f"{name}{bits}.c", single=bits == 32)
             counts = wild(folder / f"{name}{bits}.c", count, *SANITIZED)
-            flagged = "{} new starts, {} rows in several branches, {} jumps of time, {} rows with outliers"
+            flagged = "{} new starts, {} rows in several branches, {} rows with outliers"
             yield f"{count} wild steps, {name}, {bits} bits, address and undefined", flagged.format(*counts)
 
 

@@ -18,13 +18,13 @@ from nnap_em.export import online
 from nnap_em.export.model import ExportError
 from nnap_em.export.online import numbers, table, write_observer
 from nnap_em.fit.identify import begin
-from nnap_em.fit.observer import AMBIGUOUS, MISSING, OUTLIER, RESTARTED, observer
+from nnap_em.fit.observer import AMBIGUOUS, MISSING, OUTLIER, observer
 from nnap_em.fit.store import save
 from nnap_em.model.servo import Servo
 from nnap_em.model.simulate import paper_experiment, paper_model
 from nnap_em.model.state_space import with_effects
 
-DT, JUMP = 0.02, 32
+DT = 0.02
 PENDULUM = Rig(
     "bench */", "pendulum",
     {"m": Declared(0.5, 0.05), "lc": Declared(0.2, 0.0), "I": Declared(0.002, 0.0), "g": Declared(9.81, 0.0)},
@@ -112,7 +112,7 @@ def test_float_is_within_a_hundredth_of_a_standard_deviation(plain, tmp_path):
     write_observer(fitted, tmp_path / "arm.c", single=True)
     _compare(tmp_path / "arm.c", replayed, 0.01, np.float32)
     code = (tmp_path / "arm.c").read_text()
-    for doubles in ("double time", "double rows", "whole(double x)"):
+    for doubles in ("double time", "whole(double x)"):
         code = code.replace(doubles, "")
     assert "sqrtf" in code and "double" not in code
 
@@ -138,49 +138,12 @@ def test_branches_in_c_are_those_of_python(acrobot):
 
 @pytest.mark.parametrize("which, single", [("plain", True), ("acrobot", False)])
 def test_wild_input_leaves_numbers_and_no_fault(which, single, request, tmp_path):
-    """NaN, infinity, huge values, jumps, starts: under the address and undefined behaviour sanitizers.
+    """NaN, infinity, huge values, starts: under the address and undefined behaviour sanitizers.
 
     Some faults take longer than a tenth of these steps to meet, as branches of which one is impossible.
     """
     write_observer(request.getfixturevalue(which)[0], tmp_path / "wild.c", single=single)
-    assert all(wild(tmp_path / "wild.c", 30_000, *SANITIZED, "-O1")[k] > 0 for k in (0, 2, 3))
-
-
-def test_stamps_say_which_rows_are_missing(plain):
-    """Two rows that never came are as two without readings; one stamp that is wrong is a row without readings."""
-    t, u, y = _log(100, seed=1)
-    u, y = held(u), np.where(np.isnan(y), 0.0, y)
-    run = lambda t, u, y: play(plain[1], t, u, y, 2)  # noqa: E731
-    gone = np.delete(np.arange(100), [50, 51])
-    without, u_gone, held_on = y.copy(), u[gone], u.copy()
-    without[50:52], u_gone[50], held_on[50:53] = np.nan, u[50], u[50]
-    whole, found = run(t, held_on, without), run(t[gone], u_gone, y[gone])
-    np.testing.assert_allclose(found.mean[50:], whole.mean[52:], rtol=1e-12)
-    assert found.flags[50] == JUMP and not found.flags[51]
-    odd, blank = t.copy(), y.copy()
-    odd[60], blank[60] = 1e7, np.nan
-    np.testing.assert_array_equal(run(odd, u, y).mean, run(t, u, blank).mean)
-    twice = np.insert(np.arange(100), 70, 70)  # a row that comes twice counts once
-    found = run(t[twice], u[twice], y[twice])
-    np.testing.assert_array_equal(found.mean[71:], run(t, u, y).mean[70:])
-    assert found.flags[71] == JUMP
-    flags = run(
-        np.where(np.arange(100) < 60, t, t + 1e6), u, y
-    ).flags  # another clock: one row is not read, then a new start
-    assert flags[60] & JUMP and flags[61] & RESTARTED and not flags[62:].any()
-
-
-def test_smooth_inputs_go_straight_over_rows_that_never_came(fit, tmp_path):
-    write_observer(_with(fit, fit.model, smooth=True), tmp_path / "smooth.c")
-    t, u, y = _log(100, seed=1)
-    y = np.where(np.isnan(y), 0.0, y)
-    gone, without, straight = np.delete(np.arange(100), [50, 51]), y.copy(), u.copy()
-    without[50:52] = np.nan
-    straight[50:52] = u[49] + (u[52] - u[49]) * np.array([[1.0], [2.0]]) / 3
-    whole, found = (
-        play(tmp_path / "smooth.c", *log, 2) for log in ((t, straight, without), (t[gone], u[gone], y[gone]))
-    )
-    np.testing.assert_allclose(found.mean[50:], whole.mean[52:], rtol=1e-12)
+    assert all(wild(tmp_path / "wild.c", 30_000, *SANITIZED, "-O1")[k] > 0 for k in (0, 2))
 
 
 def test_a_table_is_as_exact_as_it_says():

@@ -272,7 +272,7 @@ static void report(nnap_state *s, int best)
 }
 
 /* One row: inputs held since the row before, or where these go on those of the row; readings. */
-static int row(nnap_state *s, const real *u, const real *y)
+int nnap_step(nnap_state *s, const real *u, const real *y)
 {
     const int first = s->age < -0.5 * DT;
     const real gate = s->rows < SETTLING ? INFINITY : GATE;
@@ -372,51 +372,12 @@ void nnap_start(nnap_state *s, double time)
     for (int i = 0; i < COLUMNS; i++) s->u[i] = 0;
     for (int i = 0; i < D; i++) s->fed[i] = s->past[i] = 0;
     for (int i = 0; i < M; i++) s->late[i] = NAN;
-    s->stamp = time;
-    s->odd = NAN;
     s->time = time - DT;
     s->age = -DT;
     s->rows = 0;
     s->misfit = 1;
     for (int i = 0; i < M; i++) s->innovation[i] = 0;
     report(s, 0);
-}
-
-int nnap_step(nnap_state *s, double time, const real *u, const real *y)
-{
-    real nothing[M];
-    int flags = 0;
-    double rows = 1;
-    for (int i = 0; i < M; i++) nothing[i] = NAN;
-    if (s->age >= -0.5 * DT && isfinite(time)) rows = rint((time - s->stamp) / DT);
-    if (fabs(rows) > LONGEST_GAP) {
-        flags = nnap_JUMP;
-        if (fabs(time - s->odd - DT) < 0.5 * DT) { /* two that agree are a clock */
-            flags |= nnap_RESTARTED;
-            alone(s, again_mean, again_root);
-            s->time += fabs(rows) < 1e9 ? (rows - 1) * DT : 0;
-            s->rows = 0;
-            s->misfit = 1;
-        } else {
-            s->odd = time;
-            time = s->stamp + DT;
-            y = nothing;
-        }
-        rows = 1;
-    }
-    if (rows < 1) return nnap_JUMP;
-    if (rows > 1) flags |= nnap_JUMP;
-    for (int k = 1; k < (int)rows; k++) {
-#if SMOOTH
-        real between[COLUMNS + !COLUMNS];
-        for (int i = 0; i < COLUMNS; i++) between[i] = s->u[i] + (u[i] - s->u[i]) / ((real)rows - k + 1);
-        flags |= row(s, between, nothing) & nnap_RESTARTED;
-#else
-        flags |= row(s, u, nothing) & nnap_RESTARTED;
-#endif
-    }
-    s->stamp = isfinite(time) ? time : s->stamp + DT;
-    return flags | row(s, u, y);
 }
 
 void nnap_covariance(const nnap_state *s, real *cov)

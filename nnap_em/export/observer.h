@@ -4,7 +4,7 @@
    Readings y; NaN is none: $measured.
    Parameters: $parameters.
 
-   nnap_start(&s, time), then in every row flags = nnap_step(&s, time, u, y); a time that is NaN is the next row's.
+   nnap_start(&s, time), then in every row flags = nnap_step(&s, u, y); a row without readings is one of NaN.
    s.mean and s.std are the estimate, s.innovation the readings minus their prediction over the standard deviation,
    s.misfit the mean of their squares (1 where the model is right), s.weight the probability of this branch. */
 #ifndef NNAP_H
@@ -12,10 +12,8 @@
 
 enum { $sizes };
 /* A reading is no number; one is beyond $gate standard deviations and not read; an input is no number and
-   the one before holds; the estimate diverged and starts anew; several branches are left; stamps are not in a row. */
-enum {
-    nnap_MISSING = 1, nnap_OUTLIER = 2, nnap_NO_INPUT = 4, nnap_RESTARTED = 8, nnap_AMBIGUOUS = 16, nnap_JUMP = 32
-};
+   the one before holds; the estimate diverged and starts anew; several branches are left. */
+enum { nnap_MISSING = 1, nnap_OUTLIER = 2, nnap_NO_INPUT = 4, nnap_RESTARTED = 8, nnap_AMBIGUOUS = 16 };
 
 typedef $real nnap_real;
 typedef struct {
@@ -26,13 +24,13 @@ typedef struct {
     nnap_real mean[NNAP_STATES], std[NNAP_STATES], innovation[NNAP_READINGS], late[NNAP_READINGS];
     nnap_real parameter[NNAP_PARAMETERS + !NNAP_PARAMETERS], u[NNAP_INPUTS + !NNAP_INPUTS];
     nnap_real misfit, weight, memory[$memory], fed[$drives], past[$drives];
-    double stamp, odd, time, age;
+    double time, age;
     int rows, live;
     nnap_branch branch[NNAP_BRANCHES + 2];
 } nnap_state;
 
 void nnap_start(nnap_state *s, double time);
-int nnap_step(nnap_state *s, double time, const nnap_real *u, const nnap_real *y);
+int nnap_step(nnap_state *s, const nnap_real *u, const nnap_real *y);
 void nnap_covariance(const nnap_state *s, nnap_real *covariance);
 
 #endif

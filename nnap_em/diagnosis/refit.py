@@ -43,8 +43,8 @@ class Refit(NamedTuple):
 
 def _smoothed(common, one) -> tuple[Posterior, Float[Array, "time node obs"], Gaussian]:
     """Smoothed about the linearisation, the readings at its nodes, and a path that stays where nothing is known."""
-    (affine, reading, seq), path = one
-    filtered = kalman_filter(*common, affine, reading, seq)
+    (log_q, log_r, start), ((affine, reading, seq), path) = common, one
+    filtered = kalman_filter(log_q, log_r, start, affine, reading, seq)
     posterior = linear_posterior(filtered, rts(filtered))
     nodes = jnp.concatenate([posterior.prev, posterior.next[-1:]])
     read = jnp.einsum("tos,tns->tno", reading.rows, nodes) + reading.offset[:, None]

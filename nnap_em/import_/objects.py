@@ -3,7 +3,7 @@
 import functools
 import math
 from collections.abc import Iterator, Sequence
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -36,7 +36,7 @@ def pick(message: Any, path: str) -> float:
                 at = at[_names(parent)[step[1:]]]
             else:
                 at, parent = _get(at, step), at
-        return math.nan if at is None or isinstance(at, str) else float(at)
+        return math.nan if at is None or isinstance(at, str) else float(cast(Any, at))
     except (KeyError, IndexError, ValueError, AttributeError, TypeError):
         return math.nan
 

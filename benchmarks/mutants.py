@@ -164,7 +164,7 @@ rows of a block left out
 # numerics/traced.py
 ## test_traced.py::test_another_text_of_the_package_makes_another
 a kept program whatever the package says now
-- digest(_surroundings(), function,
+- digest(surroundings(), function,
 + digest(function,
 ## test_traced.py::test_what_decides_a_program_makes_another[constant]
 a kept program whatever it was made of
@@ -326,7 +326,7 @@ M-step without its prior
 + - score)
 ## test_mstep.py::test_sequences_that_are_not_used_have_no_weight
 prior missing from the posterior precision
-- return self.symmetry(unknown, w) + own
+- return self.symmetry(unknown, w) + jax.scipy.linalg.block_diag(*own)
 + return self.symmetry(unknown, w)
 # fit/predict.py
 ## test_predict.py::test_horizon_errors_are_plain_arithmetic
@@ -755,8 +755,10 @@ a round that fails loses what was found
 + return _Searched(hypothesis, None, steps, complete=False, failure=_told(context, error))
 ## test_search.py::test_external_disturbances_are_sought_where_noise_is_not_what_the_model_says
 external disturbances sought in white noise
-- (before, data, (), ()) if white else
-+ (before, data, (), ()) if not white else
+-     if not white:
+-         diagnosis = diagnosis._replace(interventions
++     if white:
++         diagnosis = diagnosis._replace(interventions
 # diagnosis/trial.py
 ## test_rounds.py::test_the_start_of_a_law_whose_step_removes_most_is_refitted_if_that_is_enough
 a refit without a look

@@ -127,6 +127,7 @@ def test_padding_and_lost_sequences_change_nothing():
     np.testing.assert_allclose(some, squared_error(model, gather_pairs(*cut, used[:3])), rtol=1e-12)
 
 
+@pytest.mark.slow  # fast: test_loss_falls_to_that_of_the_true_transition_on_true_states
 def test_runs_with_particles_and_a_hidden_state():
     truth = _oscillator((0,))
     data, _ = _record(truth, 6, 60, key=jax.random.key(9))

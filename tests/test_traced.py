@@ -230,6 +230,7 @@ print(json.dumps([jax.device_count(), len(calls), float(np.sum(np.asarray(found.
 """
 
 
+@pytest.mark.slow  # fast: test_a_program_found_again_gives_the_same_to_the_last_bit_and_traces_nothing
 def test_over_two_devices_another_process_finds_it(tmp_path):
     """A real one: keys do not hang on what differs among processes, addresses of functions say."""
 

@@ -756,9 +756,9 @@ a round that fails loses what was found
 ## test_search.py::test_external_disturbances_are_sought_where_noise_is_not_what_the_model_says
 external disturbances sought in white noise
 -     if not white:
--         diagnosis = diagnosis._replace(interventions
+-         diagnosis = diagnosis._replace(interventions=_pushed
 +     if white:
-+         diagnosis = diagnosis._replace(interventions
++         diagnosis = diagnosis._replace(interventions=_pushed
 # diagnosis/trial.py
 ## test_rounds.py::test_the_start_of_a_law_whose_step_removes_most_is_refitted_if_that_is_enough
 a refit without a look

@@ -54,8 +54,8 @@ def work(coordinator: str, count: int, index: int, threads: int, command: list[s
     out = Path(command[place])
     with tempfile.TemporaryDirectory() as spare:
         copy = Path(spare) / "out"
-        if out.is_dir():
-            shutil.copytree(out, copy, ignore=shutil.ignore_patterns(".*.part"))
+        if (kept := out / "unfinished").is_dir():
+            shutil.copytree(kept, copy / kept.name, ignore=shutil.ignore_patterns(".*.part"))
         sys.stdout = sys.stderr = open(os.devnull, "w")  # noqa: SIM115
         sys.exit(cli.main([*command[:place], str(copy), *command[place + 1 :]]))
 

@@ -312,7 +312,7 @@ def _stop_after(steps: int, monkeypatch):
 
     def keep(self, name, outcome):
         whole(self, name, outcome)
-        if len(self) == steps:
+        if len(self.done) == steps:
             raise KeyboardInterrupt
 
     monkeypatch.setattr(Journal, "keep", keep)
@@ -350,7 +350,7 @@ def test_a_stop_before_the_first_epoch_keeps_nothing(bench, tmp_path, monkeypatc
 
     monkeypatch.setattr(identify_command, "identify", stop)
     assert nnap("identify", bench, "--out", tmp_path / "new") == 130
-    assert "nothing was kept" in capsys.readouterr().err
+    assert "nothing new is kept" in capsys.readouterr().err
     assert not (tmp_path / "new").exists()
 
 

@@ -96,23 +96,39 @@ def test_stamps_of_another_clock_are_left_out_and_memory_follows_the_samples(tmp
         np.testing.assert_array_equal(log.values[0]["u"], kept)
 
 
-EDGES = {  # times [s] and the number that is used; None: refused
-    "5 % of the times": (np.r_[T[:950], T[950:] + 2 * DAY], 950),
-    "more than 5 %": (np.r_[T[:949], T[949:] + 2 * DAY], 1000),
+EDGES = {  # times [s] and the number that is used
+    "50 times of 1000": (np.r_[T[:950], T[950:] + 2 * DAY], 950),
+    "51": (np.r_[T[:949], T[949:] + 2 * DAY], 1000),
+    "50 times of 999": (np.r_[T[:949], T[949:999] + 2 * DAY], 999),
     "a late one within a day": (np.r_[T[:1], T[1:] + 0.9 * DAY], 1000),
     "a late one": (np.r_[T[:1], T[1:] + 1.1 * DAY], 999),
-    "0.9 s back": (T - 0.9 * (T > 9.955), 1000),
-    "1.1 s back": (T - 1.1 * (T > 9.955), None),
-    "a time 5 s early": (T - 5 * (np.arange(1000) == 700), None),
-    "backwards in small steps": (T[::-1], None),
     "one of three": (np.array([0.0, 1.7e9, 1.7e9 + 1]), 3),
+    "three days without a pause": (10.0 * np.arange(26000.0), 26000),
 }
 
 
 @pytest.mark.parametrize("t, count", EDGES.values(), ids=EDGES)
 def test_which_times_are_of_one_clock(t, count):
-    kept = clock.trusted(np.round(t * NS).astype(np.int64))
-    assert (None if kept is None else kept.size) == count
+    assert clock.trusted(np.round(t * NS).astype(np.int64)).size == count
+
+
+BACK = {  # times [s], and the row that is refused
+    "0.9 s back": (T - 0.9045 * (T > 9.955), None),
+    "1.1 s back": (T - 1.1 * (T > 9.955), 997),
+    "a time 5 s early": (T - 5 * (np.arange(1000) == 700), 701),
+    "a wild one before": (T - 2 * (T > 5) + 3 * DAY * (np.arange(1000) == 300), 502),
+    "backwards in small steps": (T[::-1], 2),
+}
+
+
+@pytest.mark.parametrize("t, row", BACK.values(), ids=BACK)
+def test_a_clock_that_goes_back_is_refused_at_its_row(tmp_path, t, row):
+    t = np.round(t * NS).astype(np.int64)
+    if row is None:
+        assert clock.rising(tmp_path, "times", t, "time").t.size == t.size
+    else:
+        with pytest.raises(DataError, match=f"backwards at row {row},"):
+            clock.rising(tmp_path, "times", t, "time")
 
 
 def test_small_steps_back_in_a_table_are_sorted_and_larger_ones_refused(tmp_path):

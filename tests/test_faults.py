@@ -407,7 +407,7 @@ def test_a_step_is_done_once_for_the_same_arguments(tmp_path):
         work(effect, options, factor=float(np.nextafter(1 / 3, 1)))
         work(effect, {"key": jax.random.key(4)}, factor=1 / 3)
     assert counts["calls"] == 4
-    assert len(Journal(tmp_path / "steps")) == 3
+    assert len(Journal(tmp_path / "steps").files) == 3
 
 
 def test_clearing_leaves_what_is_not_ours(tmp_path):

@@ -58,6 +58,8 @@ LAYOUTS = {
     "no chunks": {"use_chunking": False},
     "no index, no summary": NO_INDEX,
     "one chunk": {"chunk_size": 2**30},
+    "schemas once": {"repeat_schemas": False},
+    "channels once": {"repeat_channels": False},
 }
 
 
@@ -127,6 +129,26 @@ def test_bags_of_ros_1_and_2_are_read(tmp_path, version, name):
     np.testing.assert_array_equal(track.values["position[elbow]"], Q[:, 1])
     np.testing.assert_array_equal(track.t, ns(T) - 3_000_000)
     assert track.clock == "header stamp"
+
+
+IDL = f"""{"=" * 80}
+IDL: pkg/msg/Two
+module pkg {{ module msg {{ struct Two {{ double q; pkg::msg::One one; }}; }}; }};
+{"=" * 80}
+IDL: pkg/msg/One
+module pkg {{ module msg {{ struct One {{ double u; }}; }}; }};
+"""
+
+
+@pytest.mark.parametrize("name", ["pkg/msg/Two", "pkg/Two"])
+def test_a_schema_may_be_idl_and_its_name_short(tmp_path, name):
+    *_, encode = ros2("pkg/msg/Two", f"float64 q\nOne one\n{'=' * 80}\nMSG: pkg/One\nfloat64 u\n")
+    schema = name, "ros2idl", IDL.encode(), "cdr", encode
+    messages = [SimpleNamespace(q=q, one=SimpleNamespace(u=u)) for q, u in zip(Q[:, 0], U, strict=True)]
+    path = write_mcap(tmp_path / "a.mcap", {"/two": (schema, ns(T), messages)})
+    values = _read(path, two=("q", "one.u"))["/two"].values
+    np.testing.assert_array_equal(values["q"], Q[:, 0])
+    np.testing.assert_array_equal(values["one.u"], U)
 
 
 def _protobuf():
@@ -260,7 +282,7 @@ BAD = {  # the file, what writes it, and words of the message
     "no MCAP file": ("a.mcap", lambda p: p.write_text("hello, world"), "no MCAP file"),
     "a changed bit": ("a.mcap", _flipped, "damaged (crc validation failed | another copy"),
     "unknown encoding": ("a.mcap", _unread, "'/js' | 'flatbuffer' is not read | JSON or protobuf"),
-    "IDL": ("a.mcap", lambda p: _unread(p, "cdr", "omgidl"), "'/js' | 'omgidl' | write it as"),
+    "a schema of another kind": ("a.mcap", lambda p: _unread(p, "cdr", "omgidl"), "'/js' | 'omgidl' | write it as"),
     "no stamps": ("a.mcap", lambda p: _stamped(p, None, 0 * ns(T)), "'/js' | no stamps | 300 messages | record"),
     "backwards": ("a.mcap", lambda p: _numbered(p, ns(T) - 5 * NS * (np.arange(300) > 200), 0 * ns(T)),
         "'/js' | backwards at message 202, by 4.99 s | cut the file"),

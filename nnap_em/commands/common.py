@@ -245,8 +245,9 @@ def resumable(args: argparse.Namespace, bench: Bench, log: Log) -> Iterator[Jour
     journal = Journal(args.out / UNFINISHED)
     with _folder(args.out), _reporting(journal):
         sweep(journal.folder)
-        if len(journal):
-            log(f"{counted(len(journal), 'finished step')} in {journal.folder}: those of this run are not done again")
+        if journal.files:
+            kept = counted(len(journal.files), "finished step")
+            log(f"{kept} in {journal.folder}: those of this run are not done again")
         count, rows = bench.train.data.valid.shape
         log(f"compiling for {counted(count, 'sequence')} of {rows} rows (the first time takes longest) ...")
         with keeping(journal):
@@ -257,9 +258,9 @@ def resumable(args: argparse.Namespace, bench: Bench, log: Log) -> Iterator[Jour
 
 def go_on(journal: Journal) -> str:
     """The finished steps that are kept, and how to go on from them."""
-    if not len(journal):
-        return "stopped before the end of the first step; nothing was kept"
-    return f"stopped with {counted(len(journal), 'finished step')} kept; the same command goes on"
+    if not journal.done:
+        return "stopped before the end of a step; nothing new is kept"
+    return f"stopped with {counted(len(journal.done), 'finished step')} kept; the same command goes on"
 
 
 @contextmanager

@@ -205,10 +205,10 @@ def disturbances(
             sure = np.where((samples.seq == i) & (beside[None] <= reach), 0.0, sure)
             clock = float(residual.t[i, first]), float(residual.t[i, last])
             disturbance = Intervention(i, j + 1, first, last, *clock, size, std, names.force_unit(j + 1))
-            again = any(overlap(disturbance, other) for other in out)
+            again = any(_overlap(disturbance, other) for other in out)
             if not again and repeated(means[k], samples, int(at), separation) < REPEATED:
                 out.append(disturbance)
-    return tuple(sorted((t for t in out if not any(_again(t, other, separation) for other in out)), key=in_order))
+    return tuple(sorted((t for t in out if not any(_again(t, other, separation) for other in out)), key=_in_order))
 
 
 def _again(disturbance: Intervention, other: Intervention, separation: int) -> bool:
@@ -218,7 +218,7 @@ def _again(disturbance: Intervention, other: Intervention, separation: int) -> b
     return max(disturbance.first - other.last, other.first - disturbance.last) < separation
 
 
-def in_order(disturbance: Intervention) -> tuple[int, int, int]:
+def _in_order(disturbance: Intervention) -> tuple[int, int, int]:
     """Key of a sort by recording, then time, then joint."""
     return disturbance.sequence, disturbance.first, disturbance.joint
 
@@ -254,6 +254,6 @@ def interventions(fitted: Identified, data: Dataset) -> tuple[Intervention, ...]
     return disturbances(residual(fitted, data), names_of(fitted), rig.dt, least)
 
 
-def overlap(a: Intervention, b: Intervention) -> bool:
+def _overlap(a: Intervention, b: Intervention) -> bool:
     """True if two disturbances of one joint share a row."""
     return (a.sequence, a.joint) == (b.sequence, b.joint) and a.first <= b.last and b.first <= a.last

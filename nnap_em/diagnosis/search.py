@@ -32,7 +32,7 @@ from .backward import backward
 from .context import SEARCH_EFFORT, SHORT, Effort, SearchContext, Stages, extend, smooth
 from .equations import search_equations
 from .hypothesis import Evidence, Hypothesis, covariances
-from .interventions import interventions
+from .interventions import Intervention, interventions
 from .keys import Key, key_of, remainder_of, replaced, words
 from .losses import MultiStep
 from .outcome import Diagnosis, Step, Suspect
@@ -314,8 +314,17 @@ def diagnose(
         after = diagnosis.after if any(diagnosis.evidence) else before
         diagnosis = diagnosis._replace(before=before, after=after, change=change)
     if not white:
-        diagnosis = diagnosis._replace(interventions=interventions(diagnosis.after, data))
+        diagnosis = diagnosis._replace(interventions=_pushed(diagnosis.after, data, log))
     return _branching(diagnosis)
+
+
+def _pushed(fitted: Identified, data: Dataset, log: Log) -> tuple[Intervention, ...]:
+    """External disturbances; none where they cannot be computed."""
+    try:
+        return interventions(fitted, data)
+    except FAILURES as error:
+        log(f"external disturbances are not known: a numerical failure ({error})")
+        return ()
 
 
 def _put(

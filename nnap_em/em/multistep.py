@@ -155,19 +155,22 @@ def errors(
     ages = np.pad(grid.ages, (0, max(0, len(HORIZONS + SHORT_HORIZONS) - len(grid.ages))), mode="edge")
     numbers = along.model, np.arange(grid.stride, rows, grid.stride), np.asarray(ages)  # one program for all horizons
     batch = along.state, along.linear.seq
-    if _finely_read(along.model.log_r, along.data.y):
+    if _single_enough(along):
         numbers, batch = _single((numbers, batch))
     error = np.asarray(each(_errors, numbers, batch), float)
     return error[:, : len(grid.starts(rows)), : len(grid.ages), see or channels(along.model)]
 
 
-def _finely_read(log_r: Float[Array, " obs"], y: Float[Array | np.ndarray, "seq time obs"]) -> bool:
-    """True where numbers of 32 bits tell readings apart to a hundredth of their noise: predictions take a third of the
-    time in them.
+def _single_enough(along: Followed) -> bool:
+    """True where numbers of 32 bits tell readings apart to a hundredth of their noise, times to one of a row, and
+    hidden coordinates to some 1e-4: predictions take a third of the time in them.
     """
-    largest = np.nanmax(np.abs(np.asarray(y)), axis=(0, 1), initial=0.0)
-    fine = 0.01  # of the standard deviation of a reading [1]: some hundred roundings on the way add up to a tenth
-    return bool(np.all(largest * 2.0**-24 < fine * np.exp(0.5 * np.asarray(log_r))))
+    largest = lambda a, axis: np.nanmax(np.abs(np.asarray(a)), axis=axis, initial=0.0)  # noqa: E731
+    fine, spacing = 0.01, 2.0**-24  # some hundred roundings on the way add up to a tenth
+    noise, dof = np.exp(0.5 * np.asarray(along.model.log_r)), len(along.model.system.coordinates)
+    read = largest(along.data.y, (0, 1)) * spacing < fine * noise
+    timed = largest(along.data.t, None) * spacing < fine * along.model.dt
+    return bool(np.all(read) and timed and np.all(largest(along.state[..., :dof], (0, 1)) < 1e3))
 
 
 def _single(tree: Any) -> Any:

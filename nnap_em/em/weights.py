@@ -184,7 +184,7 @@ class Weights(eqx.Module):
                 return joined(jnp.einsum("jco,jc->jo", jac, phi[:size].reshape(shape)), phi[size:])
 
             gradient = pulled(information @ (self.phi(unknown, w) - phi0) - score) + precision * (w - middle)
-            square = joined(jnp.einsum("jco,jcd,jdo->jo", jac, blocks, jac), jnp.diagonal(information)[size:])
+            square = joined(jnp.einsum("jco,jcd,jdo->jo", jac, blocks, jac), jnp.sum(root[:, size:] ** 2, axis=0))
             d = precision + damping * (precision + square)
             d = jnp.where((w <= least) & (gradient > 0), jnp.inf, d)
             wide = jnp.einsum("jco,jo,jdo->jcd", jac, 1 / d[own], jac)  # of J D^-1 J'

@@ -1,5 +1,6 @@
 """Recordings of robots: MCAP files, and bags of ROS 1 and 2; their messages are decoded one by one."""
 
+import functools
 import json
 import struct
 from array import array
@@ -43,6 +44,8 @@ class _Log:
 
     def __init__(self) -> None:
         self.channels: dict[int, Channel] = {}
+        self.counts: dict[int, int] = {}
+        """Messages of each channel, where the file has them."""
         self.notes: tuple[str, ...] = ()
         self.messages: Iterator[tuple[int, int, bytes]] = iter(())
 
@@ -54,8 +57,8 @@ def topics(path: Path) -> tuple[Topic, ...]:
         for number, _, data in log.messages:
             if len(samples[number]) < SAMPLES:
                 samples[number].append(data)
-                counts = {number: channel.messages for number, channel in log.channels.items()}
-                if all(n is not None and len(samples[i]) >= min(n, SAMPLES) for i, n in counts.items()):
+                counts = log.counts or {i: SAMPLES for i in log.channels} | {-1: 1}  # not known: to the end
+                if all(len(samples[i]) >= min(n, SAMPLES) for i, n in counts.items()):
                     break
         by_name: dict[str, Topic] = {}
         for number, (name, kind, count, decode) in sorted(log.channels.items()):
@@ -167,7 +170,7 @@ def _mcap(path: Path) -> Iterator[_Log]:
     from mcap.stream_reader import StreamReader
 
     with path.open("rb") as file:
-        log, schemas, counts = _Log(), {}, None
+        log, schemas = _Log(), {}
         try:
             summary = SeekingReader(file).get_summary()
         except Exception:  # damaged, or cut short
@@ -175,14 +178,15 @@ def _mcap(path: Path) -> Iterator[_Log]:
         file.seek(0)
 
         def channel(record: Any) -> Channel:
-            schema, count = schemas.get(record.schema_id), None if counts is None else counts.get(record.id, 0)
+            schema, count = schemas.get(record.schema_id), log.counts.get(record.id, 0) if log.counts else None
             kind = f"{schema.name if schema else 'no schema'}, {record.message_encoding}"
             return Channel(record.topic, kind, count, _decoder(record.message_encoding, schema))
 
         if summary is not None:
             schemas |= summary.schemas
-            counts = dict(summary.statistics.channel_message_counts) if summary.statistics else None
-            log.channels |= {number: channel(record) for number, record in summary.channels.items()}
+            log.counts = dict(summary.statistics.channel_message_counts) if summary.statistics else {}
+            known = {0, *schemas}
+            log.channels |= {c.id: channel(c) for c in summary.channels.values() if c.schema_id in known}
 
         def messages() -> Iterator[tuple[int, int, bytes]]:
             count = 0
@@ -212,10 +216,14 @@ def _bag(path: Path) -> Iterator[_Log]:
 
     with AnyReader([path], default_typestore=get_typestore(Stores.LATEST)) as bag:
         log = _Log()
-        for one in bag.connections:
-            decode = lambda data, kind=one.msgtype: bag.deserialize(data, kind)  # noqa: E731
-            log.channels[one.id] = Channel(one.topic, one.msgtype, one.msgcount, decode)
-        log.messages = ((one.id, t, data) for one, t, data in bag.messages())
+        lacking = "its type is not in the file, nor one of ROS"
+        for connection in bag.connections:
+            kind = connection.msgtype
+            decode = functools.partial(bag.deserialize, typ=kind)
+            decode = decode if kind in bag.typestore.fielddefs else _refused(Unread(lacking))
+            log.channels[connection.id] = Channel(connection.topic, kind, connection.msgcount, decode)
+            log.counts[connection.id] = connection.msgcount
+        log.messages = ((connection.id, t, data) for connection, t, data in bag.messages())
         yield log
 
 
@@ -226,9 +234,15 @@ def _decoder(encoding: str, schema: Any) -> Callable[[bytes], Any]:
             raise Unread(f"encoding {encoding!r} is not read")
         return _decoders[encoding](schema)
     except Unread as error:
-        reason = error
+        return _refused(error)
+    except ImportError as error:
+        return _refused(Unread(f"it cannot be read without {error.name}; {EXTRA}"))
     except Exception as error:
-        reason = Unread(f"its schema cannot be parsed ({error})")
+        return _refused(Unread(f"its schema cannot be parsed ({error})"))
+
+
+def _refused(reason: Unread) -> Callable[[bytes], Any]:
+    """A decoder that gives the reason why there is none."""
 
     def refused(_: bytes) -> Any:
         raise reason
@@ -241,9 +255,15 @@ def _cdr(schema: Any) -> Callable[[bytes], Any]:
 
     if schema is None or schema.encoding not in ("ros2msg", "ros2idl"):
         raise Unread(f"schema encoding {schema.encoding if schema else 'none'!r} of CDR messages is not read")
+    package, _, kind = schema.name.partition("/")
+    name = schema.name if kind.startswith("msg/") else f"{package}/msg/{kind}"  # some writers leave the middle out
     store, text = get_typestore(Stores.EMPTY), schema.data.decode()
-    store.register(get_types_from_msg(text, schema.name) if schema.encoding == "ros2msg" else get_types_from_idl(text))
-    return lambda data: store.deserialize_cdr(data, schema.name)
+    if schema.encoding == "ros2msg":
+        store.register(get_types_from_msg(text, name))
+    else:  # a file for each type, under bars
+        for part in filter(str.strip, text.split("=" * 80 + "\n")):
+            store.register(get_types_from_idl(part.partition("\n")[2] if part.startswith("IDL: ") else part))
+    return lambda data: store.deserialize_cdr(data, name)
 
 
 def _protobuf(schema: Any) -> Callable[[bytes], Any]:

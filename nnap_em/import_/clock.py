@@ -52,8 +52,7 @@ def choose(
     notes: tuple[str, ...] = ()
     if stamp is not None:
         order = np.argsort(log, kind="stable")
-        kept = trusted(stamp[order])
-        used = order if kept is None else order[kept]
+        used = order[trusted(stamp[order])]
         reason = _odd(stamp[used], log[used])
         if reason is None:
             return _clock(stamp, used, "header stamp", "message")._replace(lag=lags(stamp[used], log[used]))
@@ -65,11 +64,11 @@ def choose(
 def rising(path: Path, where: str, t: Int[np.ndarray, " m"], name: str, noun: str = "row") -> Clock:
     """Times [ns] in their order, where they stand or are a little out of it; refused where they are no clock."""
     kept = trusted(t)
-    if kept is None:
-        k = int(np.argmin(np.diff(t)))
+    if _behind(used := t[kept]) > BACK * SECOND:
+        k = int(np.argmin(np.diff(used)))
         hint = "the clock was set back there: cut the file at that place, or take out a row with a wrong time"
-        amount = float(t[: k + 1].max() - t[k + 1]) * 1e-9
-        refuse(path, where, f"time runs backwards at {noun} {k + 2}, by {amount:.6g} s", hint)
+        amount = float(used[: k + 1].max() - used[k + 1]) * 1e-9
+        refuse(path, where, f"time runs backwards at {noun} {kept[k + 1] + 1}, by {amount:.6g} s", hint)
     if t.size > 1 and t[kept].min() == t[kept].max():
         hint = "record with stamps, or write the time [s] of each"
         refuse(path, where, f"has no stamps: all {kept.size} {noun}s are at {t[kept[0]] * 1e-9:g} s", hint)
@@ -117,15 +116,18 @@ def in_a_row(t: Int[np.ndarray, " row"], episode: Float[np.ndarray, " row"]) -> 
     return t[0] + np.append(0, np.cumsum(np.where(new, round(100 * usual), steps)))
 
 
-def trusted(t: Int[np.ndarray, " message"]) -> Int[np.ndarray, " kept"] | None:
-    """Messages whose times [ns] are of one clock that goes on; None where it was set back in the middle of the log.
-
-    Few times far from the others are those of a clock that was not set: zeros, a wild stamp.
+def trusted(t: Int[np.ndarray, " message"]) -> Int[np.ndarray, " kept"]:
+    """Messages whose times [ns] are of the clock of most: without the few that a silence of a day separates from them,
+    zeros before a clock was set, or a wild stamp.
     """
-    far = np.abs(t - np.median(t)) > 86400.0 * SECOND
-    few = 0.05  # share of the times that may be wrong: a clock of which more are wrong was set in the middle of the log
-    kept = np.flatnonzero(~far) if far.mean() <= few else np.arange(t.size)
-    return kept if _behind(t[kept]) <= BACK * SECOND else None
+    order = np.argsort(t, kind="stable")
+    group = np.cumsum(np.append(0, np.diff(t[order]) > 86400.0 * SECOND)[: t.size])
+    size = np.bincount(group)
+    few = size <= 50  # rows that are no sequence of a machine that paused for a day
+    share = 0.05  # of the times that may be wrong: a clock of which more are wrong was set in the middle of the log
+    if not 0 < size[few].sum() <= share * t.size:
+        return np.arange(t.size)
+    return np.sort(order[~few[group]])
 
 
 def lags(stamp: Int[np.ndarray, " message"], log: Int[np.ndarray, " message"]) -> Lag:

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Int
 
 from ..data.dataset import DataError
-from ..data.formats import check_size, number, numbers, read_bytes, refuse, split
+from ..data.formats import check_size, number, numbers, read_bytes, refuse, split, unreadable
 from ..data.units import clock_of, is_episode, named_unit
 from ..numerics.digits import counted
 from .clock import in_a_row, nanoseconds, rising
@@ -173,9 +173,11 @@ def _sheet(path: Path) -> list[str]:
         raise DataError(f"{path}: workbooks cannot be read without python-calamine; {EXTRA}") from None
     try:
         rows = python_calamine.CalamineWorkbook.from_path(path).get_sheet_by_index(0).to_python(skip_empty_area=False)
+    except PermissionError as error:
+        raise unreadable(path, error) from None
     except Exception as error:  # whatever the parser raises on bytes that are no workbook
         raise DataError(f"{path}: no workbook, or damaged ({error}); save the sheet as CSV UTF-8") from None
-    text = lambda cell: cell.isoformat() if hasattr(cell, "isoformat") else str(cell)  # noqa: E731
+    text = lambda cell: cell.isoformat() if hasattr(cell, "isoformat") else " ".join(str(cell).split())  # noqa: E731
     return ["\t".join(map(text, row)) for row in rows] or [""]
 
 

@@ -26,7 +26,7 @@ from .deadline import in_time
 from .files import Kind, StoreError, read_arrays, sweep, write_arrays
 from .leaves import describe, name_of, restore
 
-STEP_KIND = Kind("nnap_em finished step", 2, "finished step", *4 * ["remove it"])
+STEP_KIND = Kind("nnap_em finished step", 2, "finished step", *4 * ["it is done again"])
 HERE: Any = object()
 """Stands for one array or number in the form of an outcome."""
 
@@ -41,18 +41,20 @@ class Journal:
         self.folder = folder
         self.open = False
         """True for a computation that was not finished in its time, and is to be continued."""
+        self.done: set[str] = set()
+        """Names of the finished steps of this computation."""
 
-    def __len__(self) -> int:
-        """Number of finished steps."""
-        return sum(1 for _ in self.folder.glob("*.npz"))
+    @property
+    def files(self) -> list[Path]:
+        """Finished steps of any computation."""
+        own = re.compile(r"[a-z_]+-[0-9a-f]{32}\.npz")
+        return [path for path in self.folder.glob("*.npz") if own.fullmatch(path.name)]
 
     def clear(self) -> None:
         """Remove the finished steps, and the folder if nothing else is in it."""
         sweep(self.folder)
-        own = re.compile(r"[a-z_]+-[0-9a-f]{32}\.npz")
-        for path in self.folder.glob("*.npz"):
-            if own.fullmatch(path.name):
-                path.unlink(missing_ok=True)
+        for path in self.files:
+            path.unlink(missing_ok=True)
         with contextlib.suppress(OSError):
             self.folder.rmdir()
 
@@ -64,6 +66,7 @@ class Journal:
             return None
         entries = header["leaves"]
         blanks, structure = jax.tree.flatten(form)
+        self.done.add(name)
         leaves = enumerate(zip(entries, blanks, strict=True))
         return jax.tree.unflatten(structure, [restore(e, arrays.get(str(i)), blank) for i, (e, blank) in leaves])
 
@@ -73,6 +76,7 @@ class Journal:
         arrays = {str(i): array for i, (_, array) in enumerate(leaves) if array is not None}
         header = {"leaves": [entry for entry, _ in leaves]}
         write_arrays(self.folder / f"{name}.npz", STEP_KIND, header, arrays)
+        self.done.add(name)
 
 
 @contextlib.contextmanager

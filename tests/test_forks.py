@@ -35,6 +35,7 @@ from nnap_em.em.multistep import (
 from nnap_em.em.noise import third_differences, white_readings
 from nnap_em.em.prior import ParameterPrior
 from nnap_em.em.shape import friction_prior
+from nnap_em.model.base import prepare
 from nnap_em.model.simulate import paper_model
 from nnap_em.model.state_space import with_effects
 from nnap_em.numerics.gaussian import Gaussian
@@ -317,3 +318,22 @@ def test_a_constant_input_is_no_error(bench):
         for candidate in kind.candidates(surroundings(rig, model, still, path, ROWS)):
             for leaf in jax.tree.leaves((candidate.start, candidate.probes)):
                 assert np.isfinite(np.asarray(leaf)).all(), candidate.start.name
+
+
+def test_every_law_can_be_predicted_in_32_bits(around, known):
+    """No number of 64 bits inside a law makes an error of types, and the errors are of 32 bits."""
+    laws = [law.candidates(around)[:1] for law in catalogue.values()]
+    assert sum(map(len, laws)) > 25
+    model = with_effects(known.model, tuple(candidate.start for few in laws for candidate in few))
+    x, seq = np.zeros((ROWS, model.start.mean.shape[0])), prepare(model, jax.tree.map(lambda a: a[0], known.data))
+    model, x, seq = multistep._single((model, x, seq))
+    grid = np.arange(5, 50, 5), np.asarray([5, 10])
+    assert eqx.filter_eval_shape(multistep._errors, (model, *grid), (x, seq)).dtype == jnp.float32
+
+
+def test_a_late_clock_and_a_wound_up_joint_need_64_bits(known):
+    along = followed(known.model, known.m_step.prior, known.path, known.data)
+    assert multistep._single_enough(along)
+    late = known.data._replace(t=known.data.t + 1.7e9)  # a session that began in 1970
+    assert not multistep._single_enough(along._replace(data=late))
+    assert not multistep._single_enough(along._replace(state=along.state + 1e3))

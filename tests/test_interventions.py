@@ -5,13 +5,11 @@ import json
 import numpy as np
 import pytest
 
-from nnap_em.data.rig import read_rig
 from nnap_em.diagnosis.interventions import Intervention, disturbances
 from nnap_em.diagnosis.residual import Names, Residual
 from nnap_em.report.diagnosis import _disturbance
 from nnap_em.report.page import page
 from nnap_em.report.tables import json_text
-from nnap_em.systems import specs
 
 DT = 0.01
 NAMES = Names(("x",), ("dx",), (False,), ("u",), (1,), ("x", "dx"))
@@ -88,9 +86,3 @@ def test_report_and_page_name_the_file(tmp_path):
     text = page({"effects": [], "interventions": [entry]})
     assert all(word in text for word in ("External disturbances", "train/b.csv", "−0.60 ± 0.10 N m"))
     assert "External disturbances" not in page({"effects": [], "interventions": []})
-
-
-def test_the_shared_rig_declares_what_a_touch_needs(shared):
-    """Every coordinate is measured."""
-    rig = read_rig(shared / "data/measured/dfki_c1_hidden_pert/rig.toml", specs)
-    assert {"theta1", "theta2"} <= set(rig.measured)

@@ -7,8 +7,8 @@ examples:
 
 OUT gets model.npz, report.html, report.json, friction.csv (joint,velocity,torque,torque_std) and friction.png.
 test/ serves for the reported prediction error only, never for the fit.  After Ctrl-C the same command goes on, with the
-same numbers.  Exit status 3 where the fit does not describe
-the motion: the first sentence of the report gives the reason.
+same numbers.  Exit status 3 where the fit does not describe the motion: the first sentence of the report gives the
+reason.
 """
 
 import argparse

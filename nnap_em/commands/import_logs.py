@@ -7,8 +7,8 @@ examples:
 
 Brings topics with clocks of their own to rows that are [sampling] dt apart, cuts sequences at gaps, and reports rates,
 jitter, gaps and rows used in FOLDER/import.json.  Where columns come from stands in the table [import.columns] of
-rig.toml; what is not there is found by its name.  MCAP (ROS 2, JSON, protobuf), ROS bags, workbooks
-and HDF5 need pip install "nnap-em[logs]".
+rig.toml; what is not there is found by its name.  MCAP (ROS 2, JSON, protobuf), ROS bags, workbooks and HDF5 need
+pip install "nnap-em[logs]".
 """
 
 import argparse

@@ -1,7 +1,7 @@
 """The search for sequences: many are drawn, the best together are taken, and each is bettered in turn.
 
 Friction has kinks, limits are walls and a free arm is chaotic, so that a slope of the cost leads nowhere for long: the
-search is a seeded one.  Motions and information of a batch of proposals are a step that a resumed run finds again.
+search is a seeded one.  Motions and information of a batch of proposals are a step, which is found again after a stop.
 """
 
 from typing import NamedTuple

@@ -213,8 +213,7 @@ def _source(fitted: Identified, stem: str, dialect: Dialect, functions: list[str
         "N": n, "M": m, "D": drives, "SCALES": scales, "COLUMNS": drives + scales, "MEMORY": memory,
         "PARAMETERS": len(own.names), "NOISE": len(own.names) - n - m, "PROCESS": len(own.names) - n,
         "COURSE": 2 * drives + 2 + scales, "ROW": 4 * drives + 2 + scales + 1,
-        "SUBSTEPS": model.steps, "SETTLING": observing.SETTLING, "ANGLES": len(angles),
-        "DEGREE": DEGREE,
+        "SUBSTEPS": model.steps, "SETTLING": observing.SETTLING, "ANGLES": len(angles), "DEGREE": DEGREE,
         "DIGITS": 23 if dialect.single else 52, "BIAS": 127 if dialect.single else 1023,
     }  # fmt: skip
     reals = {

@@ -3,7 +3,7 @@
 import functools
 import math
 from collections.abc import Iterator, Sequence
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
@@ -22,12 +22,7 @@ def flatten(message: Any) -> dict[str, float]:
 
 def pick(message: Any, path: str) -> float:
     """The number at a path; NaN where the message has none."""
-    at, names, parent = message, steps(path), None
-    while isinstance(at, dict) and path not in at and isinstance(at.get(path.partition(".")[0]), dict):
-        head, _, path = path.partition(".")
-        at, names = at[head], steps(path)
-    if isinstance(at, dict) and path in at:  # a name with dots or brackets, as `Torque [Nm]`, is one step
-        names = (path,)
+    (at, names), parent = _way(message, path), None
     try:
         for step in names:
             if isinstance(step, int):
@@ -36,9 +31,17 @@ def pick(message: Any, path: str) -> float:
                 at = at[_names(parent)[step[1:]]]
             else:
                 at, parent = _get(at, step), at
-        return math.nan if at is None or isinstance(at, str) else float(cast(Any, at))
+        return math.nan if at is None or isinstance(at, str) else float(at)
     except (KeyError, IndexError, ValueError, AttributeError, TypeError):
         return math.nan
+
+
+def _way(message: Any, path: str) -> tuple[Any, tuple[str | int, ...]]:
+    """Start and steps of a path; a name with dots or brackets, as `Torque [Nm]`, is one step."""
+    while isinstance(message, dict) and path not in message and isinstance(message.get(path.split(".")[0]), dict):
+        head, _, path = path.partition(".")
+        message = message[head]
+    return message, (path,) if isinstance(message, dict) and path in message else steps(path)
 
 
 def _numbers(at: Any, path: str) -> Iterator[tuple[str, float]]:

@@ -118,6 +118,27 @@ def test_a_fall_is_judged_once_more_with_all_rows_in_sight_only(monkeypatch):
     assert kept_paths == [False, False, False, True, True]
 
 
+def test_a_step_after_which_all_sequences_are_lost_is_refused(monkeypatch):
+    """From a mass of 1.5 on towards 9; beyond 4 nothing can be followed."""
+    tried = []
+
+    def em_step(model, data, *_, **__):
+        tried.append(_mass(model))
+        lost = tried[-1] > 4.0
+        info = MStepInfo(jnp.ones((1, 1)), np.full(4, not lost))
+        return _heavy(9.0), info, np.full(4, np.nan if lost else 10.0 + tried[-1]), np.full(4, np.inf), PATH
+
+    monkeypatch.setattr(loop, "em_step", em_step)
+    state = _state(np.full(4, -np.inf), epoch=1, stride=1.0)
+    whole = Schedule(first=9)
+    end = loop.fit(state, DATA, CubatureSmoother(StartBank((1, 1))), RULE, epochs=4, schedule=whole)
+    np.testing.assert_allclose(tried, [1.5, 9.0, 1.5 + 7.5 / 3])
+    assert _mass(end.best) == pytest.approx(4.0)
+    monkeypatch.setattr(loop, "em_step", lambda *args, **_: em_step(_heavy(9.0), DATA))
+    with pytest.raises(loop.FitError, match="all 4 sequences diverge"):
+        loop.fit(state, DATA, CubatureSmoother(StartBank((1, 1))), RULE, epochs=4, schedule=whole)
+
+
 def test_a_horizon_is_held_and_grows():
     assert [Schedule().horizon(epoch, 200) for epoch in range(9)] == [60, 60, 60, 96, 96, 154, 154, 200, 200]
 

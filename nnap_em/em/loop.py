@@ -227,7 +227,7 @@ def fit(
     nats twice running, or when less than a fifth of a step would be tried, after two refusals. Before the last stage of
     the M-step the next one then begins, from the best model. Horizons are counted from shortly before the first
     motion of each sequence.
-    Raises FitError when no sequence can be followed.
+    Raises FitError when no sequence can be followed by the first model at a horizon; later ones are refused.
     """
     longest, still = int(np.max(np.sum(np.asarray(data.valid), axis=1))), onset(np.asarray(data.y))
     stages = m_step.stages()
@@ -252,14 +252,17 @@ def fit(
         rule = rule.while_growing() if seen < longest else rule
         part, options = horizon(data, seen, still), {"kept": kept, "growing": seen < longest}
         proposal, info, loglik, ess, path = em_step(state.model, part, smoother, rule, key, **options)
-        used = np.asarray(info.used)
-        if not used.any():
+        used, followed = np.asarray(info.used), np.isfinite(state.top)
+        if not (used.any() or followed.any()):
             raise FitError(
                 f"epoch {state.epoch + 1}: all {used.size} sequences diverge within the first {seen} samples; "
                 "check units, signs and the start prior, or declare a wider one"
             )
+        same = functools.partial(_rise, state, kept, data, rule, used)
+        if kept is None or not used.any():
+            same = lambda: -math.inf  # noqa: E731
+        used = used if used.any() else followed  # where all are lost the step was too long
         state = state._replace(ess=float(np.mean(np.asarray(ess)[used])))
-        same = functools.partial(_rise, state, kept, data, rule, used) if kept is not None else lambda: -math.inf
         tried, state = state.model, _judge(state, proposal, info.hessian, np.asarray(loglik), used, same)
         kept = path if seen == longest and state.best is tried else kept
         watch(state, seen, used)

@@ -217,8 +217,8 @@ a rise along one path counts, however small
 + )
 ## test_fit.py::test_a_fall_is_judged_once_more_with_all_rows_in_sight_only
 a second look at short horizons, where a fall is cheap
-- rule, used) if kept is not None else
-+ rule, used) if True else
+- if kept is not None and used.any():
++ if used.any():
 paths of short horizons are kept
 - kept = path if seen == longest and
 + kept = path if

@@ -258,9 +258,9 @@ def fit(
                 f"epoch {state.epoch + 1}: all {used.size} sequences diverge within the first {seen} samples; "
                 "check units, signs and the start prior, or declare a wider one"
             )
-        same = functools.partial(_rise, state, kept, data, rule, used)
-        if kept is None or not used.any():
-            same = lambda: -math.inf  # noqa: E731
+        same: Callable[[], float] = lambda: -math.inf
+        if kept is not None and used.any():
+            same = functools.partial(_rise, state, kept, data, rule, used)
         used = used if used.any() else followed  # where all are lost the step was too long
         state = state._replace(ess=float(np.mean(np.asarray(ess)[used])))
         tried, state = state.model, _judge(state, proposal, info.hessian, np.asarray(loglik), used, same)

@@ -258,7 +258,7 @@ def fit(
                 f"epoch {state.epoch + 1}: all {used.size} sequences diverge within the first {seen} samples; "
                 "check units, signs and the start prior, or declare a wider one"
             )
-        same: Callable[[], float] = lambda: -math.inf
+        same: Callable[[], float] = lambda: -math.inf  # noqa: E731
         if kept is not None and used.any():
             same = functools.partial(_rise, state, kept, data, rule, used)
         used = used if used.any() else followed  # where all are lost the step was too long

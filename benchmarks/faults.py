@@ -1,4 +1,4 @@
-"""How many faults a run survives: killed at random moments and started again, does it end with the numbers of no fault?
+"""Number of faults, at random moments, after which a run that is started again ends with the numbers of no fault.
 
     python benchmarks/faults.py --faults 40 --table docs/results/faults.md     # some ten minutes on one core
 

@@ -1,4 +1,4 @@
-"""How long does an import take, and how much memory: joint states and commands of an arm at 500 Hz.
+"""Time and memory of an import: joint states and commands of an arm at 500 Hz.
 
     python benchmarks/import_logs.py --minutes 10
 

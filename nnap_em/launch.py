@@ -39,6 +39,7 @@ def work(coordinator: str, count: int, index: int, threads: int, command: list[s
     import jax
 
     from .commands import cli
+    from .commands.common import UNFINISHED
     from .numerics import parallel
 
     jax.config.update("jax_num_cpu_devices", threads)
@@ -54,8 +55,8 @@ def work(coordinator: str, count: int, index: int, threads: int, command: list[s
     out = Path(command[place])
     with tempfile.TemporaryDirectory() as spare:
         copy = Path(spare) / "out"
-        if (kept := out / "unfinished").is_dir():
-            shutil.copytree(kept, copy / kept.name, ignore=shutil.ignore_patterns(".*.part"))
+        if (kept := out / UNFINISHED).is_dir():
+            shutil.copytree(kept, copy / UNFINISHED, ignore=shutil.ignore_patterns(".*.part"))
         sys.stdout = sys.stderr = open(os.devnull, "w")  # noqa: SIM115
         sys.exit(cli.main([*command[:place], str(copy), *command[place + 1 :]]))
 

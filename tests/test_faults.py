@@ -271,7 +271,7 @@ def _answered_in_time(rig: Path, out: Path) -> None:
 
 @pytest.fixture(scope="module")
 def stopped(rig) -> Path:
-    """What is kept of a run that was killed after its fifth step."""
+    """Folder of a run that was killed after its fifth step."""
     out = rig.parent / "stopped"
     with pytest.MonkeyPatch.context() as patch, pytest.raises(Killed):
         _toys(patch, rig)

@@ -47,7 +47,7 @@ class EMState(NamedTuple):
     """Share of the way to `proposal` that is tried."""
     key: PRNGKeyArray
     loglik: Float[np.ndarray, " epoch"]
-    """Mean log-likelihood of the sequences used, of every epoch so far."""
+    """Mean log-likelihood of the sequences used, of every epoch so far; -1e6 where all diverged."""
     ess: float
     """Mean effective sample size of the last epoch; infinite where nothing is sampled."""
     stage: int = 0

@@ -29,7 +29,7 @@ class Local(NamedTuple):
 
     @property
     def filtered_from(self) -> tuple[Affine, Reading, Prepared]:
-        """What a filter needs: the same for any number of parameters, so that one program serves all."""
+        """Affine maps, readings and inputs of a filter: the same for any number of parameters."""
         return self.affine, self.reading, self.seq
 
 

@@ -128,9 +128,7 @@ class Weights(eqx.Module):
     def slopes(self, unknown, w: Float[Array, " weight"]) -> Float[Array, "dof count own"]:
         """Sensitivity of the torque of every node to the weights of its joint, which no other joint has."""
         at = lambda v: jax.grad(lambda w: jnp.sum(unknown.with_weights(w)(v)))(w)  # noqa: E731
-        own = unknown.of_joint()
-        every = jax.vmap(at)(self.nodes.T)[:, own] if own.size else jnp.zeros((self.nodes.shape[1], *own.shape))
-        return jnp.moveaxis(every, 0, 1)
+        return jnp.moveaxis(jax.vmap(at)(self.nodes.T)[:, unknown.of_joint()], 0, 1)
 
     def fit(
         self,

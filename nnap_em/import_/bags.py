@@ -29,8 +29,6 @@ class Channel(NamedTuple):
     topic: str
     kind: str
     """Type and encoding, for people."""
-    messages: int | None
-    """Number of messages; None where the file does not have it."""
     decode: Callable[[bytes], Any]
     """Message of its bytes; raises Unread where the encoding is unknown, and anything for damaged bytes."""
 
@@ -61,8 +59,9 @@ def topics(path: Path) -> tuple[Topic, ...]:
                 if all(len(samples[i]) >= min(n, SAMPLES) for i, n in counts.items()):
                     break
         by_name: dict[str, Topic] = {}
-        for number, (name, kind, count, decode) in sorted(log.channels.items()):
+        for number, (name, kind, decode) in sorted(log.channels.items()):
             fields: list[str] = []
+            count = log.counts.get(number, 0) if log.counts else None
             try:
                 fields = [field for data in samples[number] for field in flatten(decode(data))]
             except Unread as unread:
@@ -76,7 +75,7 @@ def topics(path: Path) -> tuple[Topic, ...]:
 
 
 class _Columns:
-    """What is kept of one topic: log times, and the numbers of each path, those of the header stamp after them."""
+    """Log times of one topic, and the numbers of each path, those of the header stamp last."""
 
     def __init__(self, paths: Sequence[str], stamp: Sequence[str]):
         self.paths, self.stamp = paths, stamp
@@ -178,9 +177,9 @@ def _mcap(path: Path) -> Iterator[_Log]:
         file.seek(0)
 
         def channel(record: Any) -> Channel:
-            schema, count = schemas.get(record.schema_id), log.counts.get(record.id, 0) if log.counts else None
+            schema = schemas.get(record.schema_id)
             kind = f"{schema.name if schema else 'no schema'}, {record.message_encoding}"
-            return Channel(record.topic, kind, count, _decoder(record.message_encoding, schema))
+            return Channel(record.topic, kind, _decoder(record.message_encoding, schema))
 
         if summary is not None:
             schemas |= summary.schemas
@@ -221,7 +220,7 @@ def _bag(path: Path) -> Iterator[_Log]:
             kind = connection.msgtype
             decode = functools.partial(bag.deserialize, typ=kind)
             decode = decode if kind in bag.typestore.fielddefs else _refused(Unread(lacking))
-            log.channels[connection.id] = Channel(connection.topic, kind, connection.msgcount, decode)
+            log.channels[connection.id] = Channel(connection.topic, kind, decode)
             log.counts[connection.id] = connection.msgcount
         log.messages = ((connection.id, t, data) for connection, t, data in bag.messages())
         yield log

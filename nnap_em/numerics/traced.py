@@ -54,7 +54,7 @@ def traced(run: Callable, function: Callable) -> Callable:
         leaves, structure = jax.tree.flatten(arguments)
         if _Programs.cache is None or jax.process_count() > 1 or any(isinstance(leaf, Tracer) for leaf in leaves):
             return plain(*arguments)
-        known = function, structure, tuple(_kind(leaf) if eqx.is_array(leaf) else leaf for leaf in leaves)
+        known = function, structure, tuple(_shape(leaf) if eqx.is_array(leaf) else leaf for leaf in leaves)
         if known not in _Programs.ready:
             _Programs.ready[known] = _ready(run, function, arguments, _Programs.cache)
         program = _Programs.ready[known]
@@ -134,19 +134,16 @@ def _tree(form: Any) -> Any:
     return make(map(_tree, entries))
 
 
-def _kind(a: jax.Array) -> tuple[tuple[int, ...], Any, bool]:
-    """What `_shape` says, in a tenth of the time."""
+def _shape(a: jax.Array) -> tuple[tuple[int, ...], Any, bool]:
+    """Shape and type of an array, and whether the type is weak, which a random key does not say."""
     return a.shape, a.dtype, getattr(a, "weak_type", False)
-
-
-def _shape(a: jax.Array) -> tuple[str, bool]:
-    return str(jax.typeof(a)), getattr(a, "weak_type", False)  # a random key has none
 
 
 def _key(function: Callable, arrays: list[jax.Array], static: Any) -> str:
     """Key of a program; TypeError where something may decide it that is not described whole."""
     mesh = lambda leaf: f"{leaf.axis_names} {leaf.devices.shape}" if isinstance(leaf, Mesh) else leaf  # noqa: E731
-    return digest(surroundings(), function, list(map(_shape, arrays)), jax.tree.map(mesh, static), name=_name)
+    shapes = [(shape, str(dtype), weak) for shape, dtype, weak in map(_shape, arrays)]
+    return digest(surroundings(), function, shapes, jax.tree.map(mesh, static), name=_name)
 
 
 def _name(code: Any) -> str:

@@ -110,7 +110,8 @@ def test_a_sensor_late_by_half_a_sample_reads_between_two_rows():
     case = SMALL._replace(effects=late)
     x = _run(case)
     read = plant.noise_free(plant.build(case), x)[:, 2:, 0]
-    np.testing.assert_allclose(read, 0.5 * (x[:, 1:-1, 0] + x[:, :-2, 0]), atol=4e-3)
+    bend = np.abs(np.diff(x[..., 0], 2, axis=1)).max()  # the largest acceleration, times the squared time
+    np.testing.assert_allclose(read, 0.5 * (x[:, 1:-1, 0] + x[:, :-2, 0]), rtol=0.0, atol=bend / 4)
 
 
 def test_a_coarse_encoder_reads_multiples_of_its_step():
@@ -122,7 +123,7 @@ def test_a_coarse_encoder_reads_multiples_of_its_step():
 
 @pytest.mark.parametrize("name", ["backlash", "presliding_friction", "hard_stop", "joint_flexibility"])
 def test_stiff_effects_are_integrated_finely_enough(name):
-    """With one substep they are off by 6e-3 and more."""
+    """With one substep they are off by 6e-3 and more [rad], thrice what is allowed."""
     case = SMALL._replace(effects=plant.STRONG[name])
     np.testing.assert_allclose(_run(case)[..., :2], _run(case, substeps=60)[..., :2], atol=2e-3)
 

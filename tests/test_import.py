@@ -301,6 +301,9 @@ def test_a_table_in_ms_a_name_that_stands_twice_and_a_folder_that_is_not_empty_a
     ):
         assert _import(tmp_path / name, "--rig", rig, "--out", out) == 2
         assert said in capsys.readouterr().err
+    declared = _rig(tmp_path / "declared", columns='\n[import.columns]\nu = "torque"\n')
+    assert _import(tmp_path / "a.csv", "--rig", declared, "--out", out) == 2
+    assert "a.csv: column 'u' from 'torque': the table has no field 'torque';" in capsys.readouterr().err
     log = _write(tmp_path / "a.mcap", T, T, np.cos(T))
     out.mkdir()
     (out / "mine.txt").write_text("mine")

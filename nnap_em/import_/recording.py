@@ -148,7 +148,8 @@ def field_of(file: Path, topic: Topic, path: str, where: str) -> str:
         refuse(file, where, problem, f"count from 0 to {len(row) - 1}")
     if not topic.fields:
         refuse(file, where, f"topic {topic.name!r} ({topic.kind}) holds no numbers that can be read", OTHER)
-    refuse(file, where, f"topic {topic.name!r} has no field {path!r}", near(path, topic.fields))
+    owner = f"topic {topic.name!r}" if topic.name else "the table"
+    refuse(file, where, f"{owner} has no field {path!r}", near(path, topic.fields))
 
 
 OTHER = "write it as ROS 2 CDR, JSON or protobuf, or name another topic"

@@ -290,4 +290,4 @@ def _notes(rig: Rig, signals: Mapping[str, Signal]) -> Iterator[str]:
         if rate > SLOW:
             yield f"readings of {s.topic or 'the table'} come every {rate:.3g} rows: the rows between are empty"
         else:
-            yield f"{s.topic or 'the table'} has {1 / rate:.3g} messages a row: those between rows are not used"
+            yield f"{s.topic or 'the table'} has {1 / rate:.3g} readings a row: those between rows are not used"

@@ -170,7 +170,7 @@ def _single_enough(along: Followed) -> bool:
     noise, dof = np.exp(0.5 * np.asarray(along.model.log_r)), len(along.model.system.coordinates)
     read = largest(along.data.y, (0, 1)) * spacing < fine * noise
     timed = largest(along.data.t, None) * spacing < fine * along.model.dt
-    return bool(np.all(read) and timed and np.all(largest(along.state[..., :dof], (0, 1)) < 1e3))
+    return bool(np.all(read) and timed and np.all(largest(along.state, (0, 1))[:dof] < 1e3))
 
 
 def _single(tree: Any) -> Any:

@@ -1,6 +1,6 @@
 """Every place of `mutants.py` broken in turn: the list of docs/results/mutants.csv.
 
-python benchmarks/mutation.py [--share 1/1]
+python benchmarks/mutation.py [--share 1/1] [--tests test_em.py test_mstep.py]
 """
 
 import argparse
@@ -22,8 +22,10 @@ def main() -> None:
     """Run the unbroken package, then every mutant, and print the list."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--share", default="1/1", help="i/n: every n-th mutant from the i-th on")
-    first, every = map(int, parser.parse_args().share.split("/"))
-    share = MUTANTS[first - 1 :: every]
+    parser.add_argument("--tests", nargs="*", default=[""], help="those alone whose test is in one of these files")
+    args = parser.parse_args()
+    first, every = map(int, args.share.split("/"))
+    share = [mutant for mutant in MUTANTS[first - 1 :: every] if mutant.test.startswith(tuple(args.tests))]
     print(
         f"{date.today()}, {platform.machine()}, {len(os.sched_getaffinity(0))} cores, "
         f"Python {platform.python_version()}, jax {jax.__version__}; `{' '.join(['python', *sys.argv])}`\n"

@@ -11,16 +11,19 @@ export OPENBLAS_NUM_THREADS ?= 1
 BIN := .venv/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --constraint constraints.txt
 
-# Lint and documentation side by side.
-MAKEFLAGS += --jobs=2
+SITE := NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
 .PHONY: demo test test-slow check lint docs gallery notebook matrix clean
 
 demo: .venv/.demo
 	$(BIN)/python examples/acrobot_em.py
 
-test: lint docs
-	$(BIN)/pytest $(PYTEST_FLAGS) -m "not slow"
+# Types and the site are checked beside the tests.
+test: .venv/.test
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
+	{ $(BIN)/pyright && $(SITE); } & beside=$$!; \
+	$(BIN)/pytest $(PYTEST_FLAGS) -m "not slow" && wait $$beside
 
 # Long fits, many seeds, kill and resume of real searches, shapes and types of arguments checked, which takes a third of
 # the time. SLOW="tests/test_design.py ...": those files alone.
@@ -39,7 +42,7 @@ lint: .venv/.test
 	$(BIN)/pyright
 
 docs: .venv/.test
-	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+	$(SITE)
 
 # The pictures of docs/gallery.md; runs that are in out/gallery are not repeated.
 gallery: .venv/.examples

@@ -26,7 +26,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from planted_cases import STRENGTHS, WRONG, Body, Case, Columns, Motion, Plant, Ranges, Values, case_of, split
 
-from nnap_em.data.formats import csv_fields
+from nnap_em.data.formats import csv_table
 from nnap_em.storage.files import replace_text
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -55,6 +55,12 @@ class Rig(NamedTuple):
     """Columns of its own files."""
 
 
+def _fields(path: Path) -> Text:
+    """The names in the header of a CSV file, and the fields of every row under it."""
+    table = csv_table(path)
+    return [*table.names], table.fields()
+
+
 @functools.cache
 def read(rig: str, data: Path = DATA) -> Rig:
     """A rig; of one with a hidden joint, the same windows with both joints."""
@@ -72,9 +78,9 @@ def read(rig: str, data: Path = DATA) -> Rig:
         part = f"{path.parent.name}/{path.name}"
         if path.parent.name not in ("train", "test"):
             continue
-        names, rows = texts[part] = csv_fields(full / part)
+        names, rows = texts[part] = _fields(full / part)
         logs[part] = dict(zip(names, np.asarray(rows, float).T, strict=True))
-        shown, table = csv_fields(path)
+        shown, table = _fields(path)
         for name, column in zip(shown, np.asarray(table, float).T, strict=True):
             if not np.array_equal(column, logs[part][name]):
                 raise ValueError(f"{path}: column {name!r} is not that of {full / part}")

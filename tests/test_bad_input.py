@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from nnap_em.commands import cli
 from nnap_em.commands import identify as identify_command
 from nnap_em.data.dataset import DataError
-from nnap_em.data.formats import LARGEST_FILE, read_csv
+from nnap_em.data.formats import LARGEST_FILE, read_table
 from nnap_em.em.loop import FitError
 
 MODEL = 'type = "pendulum"\nm = 0.5\nlc = 0.4\nI = 0.002\ng = 9.81\nfriction = "unknown"\nactuated_joint = 1\n'
@@ -143,9 +143,6 @@ LOGS = {  # name: (the change of train/01.csv, the words of the message: place |
     "wrapped": (_column("theta1", _wrap), "line 125, column 'theta1' | jumps by 6.283, in 2 places | --unwrap theta1"),
     "wrapped degrees": (_column("theta1", lambda x: np.degrees(_wrap(x))),
         "line 125 | jumps by 360, in | degrees to rad"),
-    "utf-16": (lambda s: s.encode("utf-16"), "line 1 | not UTF-8 | save the file as plain UTF-8"),
-    "latin-1": (lambda s: s.replace("\n", ",\n").replace(",\n", ",note_°\n", 1).encode("latin-1"),
-        "line 1 | not UTF-8 | plain UTF-8"),
     "angle in degrees": (_column("theta1", np.degrees), "column 'theta1' | 57.3 times | write rad"),
     "rate in degrees": (_column("dtheta1", np.degrees), "column 'dtheta1' | 0.0175 times | write rad and rad/s"),
     "angle in turns": (_column("theta1", lambda x: x / (2 * np.pi)),
@@ -284,5 +281,5 @@ def test_any_corrupted_field_is_named_with_its_line_and_column(tmp_path_factory,
     name = list(swing())[column]
     path.write_text(with_field(row + 2, name, bad)(csv_text(swing(20))))
     with pytest.raises(DataError) as refused:
-        read_csv(path, ("time", "u"), ("theta1", "dtheta1"))
+        read_table(path, ("time", "u"), ("theta1", "dtheta1"))
     assert f"line {row + 2}, column {name!r}: found {bad.strip()!r}" in str(refused.value)

@@ -125,10 +125,10 @@ BACK = {  # times [s], and the row that is refused
 def test_a_clock_that_goes_back_is_refused_at_its_row(tmp_path, t, row):
     t = np.round(t * NS).astype(np.int64)
     if row is None:
-        assert clock.rising(tmp_path, "times", t, "time").t.size == t.size
+        assert clock.rising(tmp_path, "times", t, {}, "time").t.size == t.size
     else:
         with pytest.raises(DataError, match=f"backwards at row {row},"):
-            clock.rising(tmp_path, "times", t, "time")
+            clock.rising(tmp_path, "times", t, {}, "time")
 
 
 def test_small_steps_back_in_a_table_are_sorted_and_larger_ones_refused(tmp_path):
@@ -151,9 +151,8 @@ def test_rows_of_one_stamp_keep_all_their_columns(tmp_path):
     for name, values in _columns(T).items():
         np.testing.assert_allclose(log.values[0][name], values, rtol=0, atol=1e-9)  # times are in ns, at 9 rad/s^2
     times = np.array([0, 0, 1, 1, 1, 2])
-    track = clock.rising(tmp_path, "times", times, "time")
-    values = np.array([1.0, np.nan, np.nan, 2.0, 3.0, np.nan])
-    np.testing.assert_array_equal(track.take(values), [1.0, 3.0, np.nan])  # the last of each, if there is one
+    track = clock.rising(tmp_path, "times", times, {"u": np.array([1.0, np.nan, np.nan, 2.0, 3.0, np.nan])}, "time")
+    np.testing.assert_array_equal(track.values["u"], [1.0, 3.0, np.nan])  # the last of each, if there is one
 
 
 UNITS = {"s": 1, "ms": 10**3, "us": 10**6, "ns": 10**9}
@@ -252,23 +251,22 @@ def test_a_text_that_is_no_date_is_named_with_its_line(tmp_path):
 
 
 @pytest.mark.parametrize("end", ["\n", "\r\n", "\n \n\n"])
-def test_a_csv_file_in_blocks_is_the_same_and_of_any_size(tmp_path, monkeypatch, end):
-    t = np.round(T, 6)
-    path = _csv(tmp_path / "a.csv", t, _columns(T))
+def test_a_csv_file_in_blocks_is_the_same_and_one_of_a_sequence_is_of_limited_size(tmp_path, monkeypatch, end):
+    path = _csv(tmp_path / "a.csv", np.round(T, 6), _columns(T))
     path.write_bytes(path.read_bytes().replace(b"\n", end.encode() if len(end) < 3 else b"\n") + end[2:].encode())
-    whole = formats.read_csv(path, ("time",), ("theta1", "u"))
+    whole = formats.read_table(path, ("time",), ("theta1", "u"))
     np.testing.assert_array_equal(whole[:, 2], _columns(T)["u"])
-    monkeypatch.setattr(formats, "TEXT_BYTES", 100)
-    monkeypatch.setattr(formats, "LARGEST_FILE", 1000)
-    np.testing.assert_array_equal(formats.read_log(path, ("time",), ("theta1", "u")), whole)
-    with pytest.raises(DataError, match="too much for one sequence"):
-        formats.read_table(path, ("time",), ("u",))
+    monkeypatch.setattr(formats, "BLOCK", 7)
+    np.testing.assert_array_equal(formats.read_table(path, ("time",), ("theta1", "u")), whole)
     lines = path.read_text().split("\n")
     words = {"1,2,3": "line 701: found 3 fields", "1,2,x,3": "line 701, column 'theta1'", "": "line 701: found 1 field"}
     for text, said in words.items():
         path.write_text("\n".join([*lines[:700], text, *lines[701:]]))
         with pytest.raises(DataError, match=said):
-            formats.read_log(path, ("time",), ("theta1", "u"))
+            formats.read_table(path, ("time",), ("theta1", "u"))
+    monkeypatch.setattr(formats, "LARGEST_FILE", 1000)
+    with pytest.raises(DataError, match="too much for one sequence"):
+        formats.read_table(path, ("time",), ("u",))
 
 
 OFFSETS = {  # of the header stamps from log times [s], and what the page has about it

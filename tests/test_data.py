@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from nnap_em.data.dataset import DataError, Dataset, fill_missing, horizon, pad
-from nnap_em.data.formats import read_csv, write_csv
+from nnap_em.data.formats import read_table, write_csv
 from nnap_em.data.logs import DataWarning, check_split, logs_of_arrays, read_logs, sequences_of
 from nnap_em.data.rig import Rig, read_rig
 from nnap_em.systems import specs
@@ -140,7 +140,7 @@ def test_what_is_written_is_read_back(tmp_path_factory, rows, start):
     t = start + 0.001 * np.arange(len(rows))
     readings = np.array(rows).T
     write_csv(path, {"time": t, "a": readings[0], "b": readings[1]})
-    table = read_csv(path, ("time",), ("b", "a"))
+    table = read_table(path, ("time",), ("b", "a"))
     np.testing.assert_allclose(table[:, 0], t, rtol=0.0, atol=1e-6)  # a session's clock keeps its milliseconds
     np.testing.assert_allclose(table[:, 1:].T, readings[::-1], rtol=1e-11, atol=1e-300)
 

@@ -22,7 +22,7 @@ from nnap_em.data import formats
 from nnap_em.data.dataset import DataError
 from nnap_em.data.logs import DataWarning, read_logs
 from nnap_em.data.rig import RigError, read_rig
-from nnap_em.import_ import text_file
+from nnap_em.import_ import table_file, text_file
 from nnap_em.import_.columns import resolve
 from nnap_em.import_.declared import read_plan
 from nnap_em.import_.files import reader
@@ -421,10 +421,10 @@ _lines = st.lists(st.lists(st.text('0159.,;-eE\t"#NameTrueX_Value[]°', max_size
 def test_any_text_is_read_or_refused(tmp_path_factory, rows, separator):
     path = tmp_path_factory.getbasetemp() / "any.txt"
     path.write_text("\n".join(separator.join(row) for row in rows))
-    text_file.foreign(path)
     try:
-        wanted = {topic.name: topic.fields for topic in text_file.topics(path)}
-        for track in text_file.read(path, wanted).tracks.values():
+        text_file.foreign(path)
+        wanted = {topic.name: topic.fields for topic in table_file.topics(path)}
+        for track in table_file.read(path, wanted).tracks.values():
             assert (np.diff(track.t) > 0).all()
     except DataError as refused:
         assert str(path) in str(refused) and ";" in str(refused)

@@ -1,13 +1,16 @@
 """One log file as named columns of numbers: CSV in and out, Parquet and MAT in; every mistake refused with a hint."""
 
+import codecs
 import csv
 import difflib
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, NoReturn, TextIO
+from typing import NamedTuple, NoReturn
 
 import numpy as np
 import scipy.io
@@ -22,8 +25,11 @@ from .rig import nearest
 from .units import clock_of, is_time
 
 LARGEST_FILE = 256 * 2**20  # bytes of the file of one sequence: some million rows
-TEXT_BYTES = 2**20  # bytes of text that are split at once, which take some 40 times as much memory
+BLOCK = 20_000  # rows whose fields are split at once, which take some 40 times the memory of their text
+PLAIN = (",", ".")
+"""Marks of columns and of decimals in the CSV files of a data set."""
 Table = Float[np.ndarray, "time column"]
+Rows = slice | np.ndarray
 
 
 def has_logs(folder: Path) -> bool:
@@ -46,29 +52,51 @@ def log_files(folder: Path) -> list[Path]:
 
 
 def read_table(path: Path, required: Sequence[str], gaps: Sequence[str] = ()) -> Table:
-    """The columns `required`, then `gaps`, of a log in the format that its name ends in; NaN = missing (`gaps` only).
+    """The columns `required`, then `gaps`, of the log of a sequence; NaN where one of `gaps` is missing.
 
     Raises DataError that names the row and the column.
     """
     check_size(path)
-    return _of(path, _readers)(path, required, gaps)
-
-
-def read_log(path: Path, required: Sequence[str], gaps: Sequence[str]) -> Table:
-    """The same of a log of any size, whose times may be dates [s since 1970]."""
-    return _of(path, _readers)(path, required, gaps, True)
+    return columns_of(table_of(path), required, gaps)
 
 
 def column_names(path: Path) -> list[str]:
     """The names of the columns of a log, in the order of the file."""
-    return _of(path, _namers)(path)
+    return split(text_lines(path)[0]) if path.suffix.lower() == ".csv" else list(table_of(path).names)
 
 
-def _of(path: Path, functions: Mapping[str, Callable[..., Any]]) -> Callable[..., Any]:
-    """The function for the kind of a file; DataError where there is none."""
-    if path.suffix.lower() not in functions:
+def table_of(path: Path) -> "TextTable | ArrayTable":
+    """The content of a log by the end of its name; DataError where it is of no kind that is read."""
+    kind = path.suffix.lower()
+    if kind not in _KINDS:
         raise DataError(f"{path}: no log (*.csv, *.parquet or *.mat); `nnap-em import` converts those of other kinds")
-    return functions[path.suffix.lower()]
+    return csv_table(path) if kind == ".csv" else ArrayTable(path, _KINDS[kind](path))
+
+
+def columns_of(
+    table: "TextTable | ArrayTable",
+    required: Sequence[str],
+    gaps: Sequence[str] = (),
+    *,
+    dates: bool = False,
+    rows: Rows = slice(None),
+) -> Table:
+    """The columns `required`, then `gaps`, in file units; NaN where one of `gaps` is missing.
+
+    `dates`: texts of `required` may be dates.  Raises DataError that names the row and the column.
+    """
+    path = table.path
+    _check_names(path, table.names, required, gaps)
+    columns = {name: table.column(name, dates=dates, rows=rows) for name in required}
+    columns |= {name: table.column(name, gaps=True, rows=rows) for name in gaps}
+    count = np.size(next(iter(columns.values())))
+    if count < 2:
+        _too_few(path, "the file", count)
+    for name, values in columns.items():
+        if values.shape != (count,):
+            shape = " x ".join(map(str, values.shape)) or 1
+            refuse(path, f"column {name!r}", f"is {shape}, the first has {count} rows", "give all columns one length")
+    return np.stack([*columns.values()], -1)
 
 
 def place(path: Path, column: str, row: int | None = None) -> str:
@@ -109,25 +137,26 @@ def header_hint(path: Path) -> str | None:
     """The hint where line 1 of a CSV file is no header of columns separated by ','; None where it may be one."""
     if path.suffix.lower() != ".csv":
         return None
-    first, last = _ends(path)
+    lines = text_lines(path)
+    first, last = lines[0], lines[-1]
     if all(map(_is_number, first.split(","))):
         return "line 1 holds numbers: write a header"
     above = "remove the lines above the header" if first.count(",") < last.count(",") else None
-    return _separator_hint(path) or above
+    return _separator_hint(first, last) or above
 
 
 def dated_csv(path: Path) -> bool:
     """True for a CSV file whose times are dates or times of day."""
-    lines = read_bytes(path, 2**18).decode("utf-8-sig", errors="replace").splitlines()
+    lines = text_lines(path)
     names, row = split(lines[0]), split("".join(lines[1:2]))
     clock = clock_of(names)[0]
     return clock is not None and len(row) == len(names) and not _is_number(row[names.index(clock)])
 
 
-def untimed(path: Path, names: Sequence[str]) -> str | None:
+def untimed(names: Sequence[str]) -> str | None:
     """The hint where a column may be meant as the times; None where a table has no such column at all."""
     like = [name for name in names if is_time(name) or difflib.get_close_matches("time", [name.casefold()])]
-    return header_hint(path) or (f"name it 'time' [s], if {like[0]!r} is that" if like else None)
+    return f"name it 'time' [s], if {like[0]!r} is that" if like else None
 
 
 def split(line: str, separator: str = ",") -> list[str]:
@@ -141,123 +170,184 @@ def split(line: str, separator: str = ",") -> list[str]:
     return [field.strip() for field in fields]
 
 
-def csv_fields(path: Path) -> tuple[list[str], list[list[str]]]:
-    """The names in the header of a CSV file, and the fields of every row under it."""
-    names = split(_first_line(path))
-    return names, [row for first, lines in _blocks(path) for row in _fields(path, names, first, lines)]
+def text_lines(path: Path) -> list[str]:
+    """The lines of a text in UTF-8, UTF-16 with its mark, or else as Windows writes it in western Europe.
 
-
-def read_csv(path: Path, required: Sequence[str], gaps: Sequence[str] = (), dates: bool = False) -> Table:
-    """The columns `required`, then `gaps`, of a CSV file with a header, in file units; NaN = empty field (`gaps` only).
-
-    `dates`: texts of `required` may be dates of ISO 8601.  Raises DataError that names the line and the column.
+    Those that are blank at the end are left out; DataError where none is left.
     """
-    names = split(_first_line(path))
-    _check_names(path, names, required, gaps)
-    places = {name: names.index(name) for name in (*required, *gaps)}
-
-    def table(first: int, lines: Sequence[str]) -> Table:
-        if (plain := _plain(lines, len(names))) is not None:
-            return plain[:, [*places.values()]]
-        columns = [*zip(*_fields(path, names, first, lines), strict=True)]
-        numbered = range(first + 2, first + 2 + len(lines))
-        return np.stack([numbers(path, name, numbered, columns[i], name in gaps, dates and name in required)
-                         for name, i in places.items()], -1)  # fmt: skip
-
-    return np.concatenate([table(first, lines) for first, lines in _blocks(path)])
+    wide = read_bytes(path, 2) in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+    try:
+        text = path.read_text("utf-16", "replace") if wide else path.read_text("utf-8-sig")
+    except UnicodeDecodeError:
+        text = path.read_text("cp1252", "replace")
+    lines = text.rstrip().split("\n")
+    if lines == [""]:
+        refuse(path, "line 1", "the file is empty", "write a header and one row per sample, or remove the file")
+    return lines
 
 
-def read_parquet(path: Path, required: Sequence[str], gaps: Sequence[str] = (), dates: bool = False) -> Table:
-    """The same of a Parquet file, where null and NaN are missing samples."""
-    names = _parquet_columns(path)
-    _check_names(path, list(names), required, gaps)
-    with _damaged(path, "Parquet"):
-        table = _parquet_file(path).read(columns=list(dict.fromkeys(names[name][0] for name in (*required, *gaps))))
-        columns = {name: _entry(table[names[name][0]], names[name][1]) for name in (*required, *gaps)}
-    return _stack(path, columns, gaps, dates)
+@dataclass(frozen=True)
+class TextTable:
+    """Rows of text under names, whose fields are split when they are read."""
+
+    path: Path
+    names: Sequence[str]
+    lines: Sequence[str]
+    first: int = 2
+    """Line of the file in which the first row stands, from 1."""
+    marks: tuple[str, str] = PLAIN
+    """Marks of columns and of decimals."""
+    exact: bool = True
+    """Each row has a field for each name; otherwise the last ones may be absent, and TRUE is 1."""
+
+    def fields(self, start: int = 0, end: int | None = None) -> list[list[str]]:
+        """The fields of rows, as many as there are names."""
+        width, out = len(self.names), []
+        for at, line in enumerate(self.lines[start:end], self.first + start):
+            row = split(line, self.marks[0])
+            if not self.exact:
+                row = trimmed(truths(row))
+                row += [""] * (width - len(row))
+            if len(row) != width:
+                hint = "separate columns by ',', write decimals with '.', give every column a field"
+                hint = _separator_hint(line, line) or f"{hint}; line 1 is the header"
+                other = "name every column; mark columns and decimals differently"
+                problem = f"found {counted(len(row), 'field')} under {counted(width, 'name')}"
+                refuse(self.path, f"line {at}", problem, hint if self.exact else other)
+            if self.exact and at == 2 and not any(map(_is_number, row)):
+                hint = header_hint(self.path) or "remove the row of units"
+                refuse(self.path, "line 2", f"holds no number, found {','.join(row)!r}", hint)
+            out.append(row)
+        return out
+
+    @cached_property
+    def values(self) -> Table:
+        """Numbers of all fields: NaN where one is empty, infinite where it is a text."""
+        starts = range(0, len(self.lines), BLOCK)
+        return np.concatenate([self._block(start, start + BLOCK) for start in starts])
+
+    def _block(self, start: int, end: int) -> Table:
+        lines, (mark, decimal) = self.lines[start:end], self.marks
+        with suppress(ValueError):  # at full speed, where all of them are finite numbers
+            table = np.loadtxt(lines, delimiter=mark or None, comments=None, ndmin=2)
+            if decimal == "." and table.shape == (len(lines), len(self.names)) and np.isfinite(table).all():
+                return table
+        columns = zip(*self.fields(start, end), strict=True)
+        return np.array([_numbers(texts, decimal) for texts in columns]).T
+
+    def texts(self, name: str, rows: Rows = slice(None)) -> list[str]:
+        """The fields of one column."""
+        i = self.names.index(name)
+        return [self.fields(k, k + 1)[0][i] for k in np.arange(len(self.lines))[rows].tolist()]
+
+    def column(self, name: str, *, gaps: bool = False, dates: bool = False, rows: Rows = slice(None)) -> np.ndarray:
+        """One column as finite numbers, or NaN where `gaps` allow that; as seconds where it has dates."""
+        values = self.values[rows, self.names.index(name)]
+        dates = dates and bool(np.isinf(values[:1]).any())
+        values = moments(self.texts(name, rows)) if dates else values
+        if (k := _wrong(values, gaps)) is not None:
+            line = int(np.arange(len(self.lines))[rows][k])
+            where, text = f"line {self.first + line}, column {name!r}", repr(self.texts(name, slice(line, line + 1))[0])
+            if dates:
+                refuse(self.path, where, f"found {text}", "write seconds, or dates such as 2026-11-03T23:59:40.010")
+            _no_number(self.path, where, text, bool(np.isnan(values[k])), gaps)
+        return values
 
 
-def read_mat(path: Path, required: Sequence[str], gaps: Sequence[str] = (), dates: bool = False) -> Table:
-    """The same of a MAT file (version 7 or older): one vector per column, or one struct of them; NaN is missing."""
-    columns = _mat_columns(path)
-    _check_names(path, list(columns), required, gaps)
-    return _stack(path, {name: np.asarray(columns[name]) for name in (*required, *gaps)}, gaps, dates)
+def csv_table(path: Path, lines: Sequence[str] = ()) -> TextTable:
+    """A CSV file, or its lines: names in line 1, then rows."""
+    first, *rows = lines or text_lines(path)
+    if len(rows) < 2:
+        _too_few(path, f"line {len(rows) + 1}", len(rows))
+    return TextTable(path, split(first), rows)
 
 
-_readers: dict[str, Callable[..., Table]] = {".csv": read_csv, ".parquet": read_parquet, ".mat": read_mat}
+class ArrayTable(NamedTuple):
+    """Columns of a file that stores numbers as such, which are read one by one."""
+
+    path: Path
+    columns: Mapping[str, Callable[[], np.ndarray]]
+
+    @property
+    def names(self) -> Sequence[str]:
+        """The names of the columns."""
+        return list(self.columns)
+
+    def column(self, name: str, *, gaps: bool = False, dates: bool = False, rows: Rows = slice(None)) -> np.ndarray:
+        """One column as finite numbers, or NaN where `gaps` allow that; as seconds where it has dates."""
+        with _damaged(self.path):
+            values = self.columns[name]()
+        if dates and values.dtype.kind in "MmOSU":
+            values = dated(values)
+        if values.dtype.kind not in "iuf":
+            hint = "store it as 64-bit floating point"
+            refuse(self.path, f"column {name!r}", f"holds {values.dtype}, no numbers", hint)
+        values = values.astype(np.float64)
+        if (k := _wrong(values, gaps)) is not None:
+            value = values.ravel()[k]
+            _no_number(self.path, place(self.path, name, k), f"{value:g}", bool(np.isnan(value)), gaps)
+        return values[rows] if values.ndim else values
 
 
-def _mat_columns(path: Path) -> dict[str, Any]:
+def _mat(path: Path) -> dict[str, Callable[[], np.ndarray]]:
     """The columns of a MAT file: its vectors, those of a struct alone, and those of structs that recorders write."""
-    with _damaged(path, "MAT"):
+    with _damaged(path):
         try:
             content = scipy.io.loadmat(path, squeeze_me=True, struct_as_record=True)
         except NotImplementedError:
             refuse(path, "the file", "a MAT file of version 7.3", "save it with save(..., '-v7')")
     variables = {name: np.asarray(value) for name, value in content.items() if not name.startswith("__")}
-    out: dict[str, Any] = {}
+    out: dict[str, np.ndarray] = {}
     for name, column in mat_columns(path, variables):
         if name in out and not np.array_equal(out[name], column):
             hint = "save signals of one sample time, with different names, to a file"
             refuse(path, f"column {name!r}", "stands there twice with different numbers", hint)
-        out |= _entries(name, np.asarray(column))
-    return out
+        column = np.asarray(column)
+        if column.ndim == 2 and column.dtype.kind in "iuf":  # a matrix, longer than wide: yout[0] and so on
+            columns = column.T if column.shape[0] > column.shape[1] else column
+            out |= {f"{name}[{i}]": each for i, each in enumerate(columns)}
+        else:
+            out[name] = column
+    return {name: lambda values=values: values for name, values in out.items()}
 
 
-def _entries(name: str, column: np.ndarray) -> dict[str, np.ndarray]:
-    """A vector; the columns of a matrix, `yout[0]` and so on, which is longer than wide."""
-    if column.ndim != 2 or column.dtype.kind not in "iuf":
-        return {name: column}
-    columns = column.T if column.shape[0] > column.shape[1] else column
-    return {f"{name}[{i}]": each for i, each in enumerate(columns)}
-
-
-def _parquet_file(path: Path) -> Any:
+def _parquet(path: Path) -> dict[str, Callable[[], np.ndarray]]:
+    """The columns of a Parquet file; where a row holds a list, one for each entry of the first."""
     try:
-        from pyarrow import parquet
+        from pyarrow import compute, parquet
     except ImportError:
         hint = "pip install 'nnap-em[formats]', or write the log as CSV"
         raise DataError(f"{path}: cannot be read without pyarrow; {hint}") from None
-    with _damaged(path, "Parquet"):
-        return parquet.ParquetFile(path)
-
-
-def _parquet_columns(path: Path) -> dict[str, tuple[str, int | None]]:
-    """The columns by their names; where a row holds a list, one for each entry of the first."""
-    file, out = _parquet_file(path), {}
-    _enough(path, file.metadata.num_rows)
-    with _damaged(path, "Parquet"):
+    out: dict[str, Callable[[], np.ndarray]] = {}
+    with _damaged(path):
+        file = parquet.ParquetFile(path)
+        if (rows := file.metadata.num_rows) < 2:
+            _too_few(path, "the file", rows)
         for field in file.schema_arrow:
+            name = field.name
+            column = lambda name=name: file.read(columns=[name])[name]  # noqa: E731
             if "list" not in str(field.type):
-                out[field.name] = (field.name, None)
+                out[name] = lambda column=column: column().to_numpy()
                 continue
-            first = next(file.iter_batches(1, columns=[field.name]))[0][0].as_py() or ()
-            out |= {f"{field.name}[{i}]": (field.name, i) for i in range(len(first))}
+            for i in range(len(next(file.iter_batches(1, columns=[name]))[0][0].as_py() or ())):
+                entry = lambda column=column, i=i: compute.call_function("list_element", [column(), i])  # noqa: E731
+                out[f"{name}[{i}]"] = lambda entry=entry: entry().to_numpy()
     return out
 
 
-def _entry(column: Any, index: int | None) -> np.ndarray:
-    """One column, or one entry of the list in each of its rows."""
-    if index is None:
-        return column.to_numpy()
-    from pyarrow import compute
-
-    return compute.call_function("list_element", [column, index]).to_numpy()
-
-
-_namers: dict[str, Callable[[Path], list[str]]] = {
-    ".csv": lambda path: split(_first_line(path)),
-    ".parquet": lambda path: list(_parquet_columns(path)),
-    ".mat": lambda path: list(_mat_columns(path)),
+_KINDS: dict[str, Callable[[Path], Mapping[str, Callable[[], np.ndarray]]]] = {
+    ".csv": lambda path: {},
+    ".parquet": _parquet,
+    ".mat": _mat,
 }
 
 
 def _logs(folder: Path) -> list[Path]:
-    return sorted(p for p in folder.glob("*") if p.suffix.lower() in _readers and not p.name.startswith("."))
+    return sorted(p for p in folder.glob("*") if p.suffix.lower() in _KINDS and not p.name.startswith("."))
 
 
 @contextmanager
-def _damaged(path: Path, form: str) -> Iterator[None]:
+def _damaged(path: Path) -> Iterator[None]:
     """Whatever a parser raises on bytes that are none of its format, as a DataError."""
     try:
         yield
@@ -266,6 +356,7 @@ def _damaged(path: Path, form: str) -> Iterator[None]:
     except Exception as error:
         if isinstance(error, OSError) and error.errno:
             raise unreadable(path, error) from None
+        form = {".mat": "MAT", ".parquet": "Parquet"}[path.suffix.lower()]
         hint = "use another copy, or write it as CSV"
         raise DataError(f"{path}: no {form} file, or damaged or cut short; {hint}") from None
 
@@ -295,48 +386,32 @@ def read_bytes(path: Path, most: int = -1) -> bytes:
         raise unreadable(path, error) from None
 
 
-@contextmanager
-def _opened(path: Path) -> Iterator[TextIO]:
-    """A file as text; whatever is wrong with it as a DataError."""
-    try:
-        with path.open(encoding="utf-8-sig") as file:
-            yield file
-    except OSError as error:
-        raise unreadable(path, error) from None
-    except UnicodeDecodeError:
-        line = read_bytes(path).decode(errors="replace").partition("\ufffd")[0].count("\n") + 1
-        refuse(path, f"line {line}", "not UTF-8", "save the file as plain UTF-8 text")
-
-
-def _first_line(path: Path) -> str:
-    with _opened(path) as file:
-        line = file.readline()
-        if not line.strip() and not any(map(str.strip, file)):
-            refuse(path, "line 1", "the file is empty", "write a header and one row per sample, or remove the file")
-    return line.rstrip("\n")
-
-
-def _ends(path: Path) -> tuple[str, str]:
-    """The first and the last line of a text file."""
-    with path.open("rb") as file:
-        file.seek(max(path.stat().st_size - TEXT_BYTES, 0))
-        return _first_line(path), file.read().decode(errors="replace").strip().splitlines()[-1]
-
-
-def _separator_hint(path: Path) -> str | None:
-    first, last = _ends(path)
-    other = next((mark for mark in (";", "\t") if mark in first and mark in last), None)
-    return f"separate columns by ',' (not {other!r}), decimals by '.'" if other else None
-
-
 def number(text: str, decimal: str = ".") -> float:
     """A number; NaN for an empty field, infinite for another text."""
     if decimal == ",":
         text = text.replace(".", "?").replace(",", ".")
     try:
-        return float(text.replace("_", "?") or "nan")  # Python takes 1_0 for 10
+        return float(text or "nan") if "_" not in text else math.inf  # Python takes 1_0 for 10
     except ValueError:
         return math.inf
+
+
+def _numbers(texts: Sequence[str], decimal: str) -> list[float]:
+    """The numbers of fields, the faster where all are numbers or empty."""
+    with suppress(ValueError):
+        if decimal == "." and "_" not in "".join(texts):
+            return [float(text) if text else math.nan for text in texts]
+    return [number(text, decimal) for text in texts]
+
+
+def truths(row: Sequence[str]) -> list[str]:
+    """Fields with the truth values of a PLC as numbers."""
+    return [{"TRUE": "1", "FALSE": "0"}.get(text.upper(), text) for text in row]
+
+
+def trimmed(row: Sequence[str]) -> list[str]:
+    """The fields up to the last one that is not empty."""
+    return list(row[: max((k for k, text in enumerate(row, 1) if text), default=0)])
 
 
 def _is_number(field: str) -> bool:
@@ -344,44 +419,9 @@ def _is_number(field: str) -> bool:
     return not math.isinf(number(field.strip()))
 
 
-def _blocks(path: Path) -> Iterator[tuple[int, list[str]]]:
-    """The lines under the header in blocks, each with the number of its first, from 0; without blank ones at the end.
-
-    Two rows at least, or a DataError.
-    """
-    count, lines = 0, []
-    with _opened(path) as file:
-        file.readline()
-        while block := file.readlines(TEXT_BYTES):
-            lines += block
-            blank = next((k for k, line in enumerate(reversed(lines)) if line.strip()), len(lines))
-            lines, rest = lines[: len(lines) - blank], lines[len(lines) - blank :]
-            if lines:
-                yield count, lines
-            count, lines = count + len(lines), rest
-    if count < 2:
-        refuse(path, f"line {count + 1}", f"found {counted(count, 'row')}", "write a header and 2 rows or more")
-
-
-def _plain(lines: Sequence[str], columns: int) -> Table | None:
-    """All fields of the lines at full speed; None where one is no finite number, or they are not so many in each."""
-    with suppress(ValueError):
-        table = np.loadtxt(lines, delimiter=",", comments=None, ndmin=2)
-        return table if table.shape == (len(lines), columns) and np.isfinite(table).all() else None
-
-
-def _fields(path: Path, names: Sequence[str], first: int, lines: Sequence[str]) -> list[list[str]]:
-    """The fields of lines, as many as there are names; the first line is row `first`."""
-    rows = [split(line) for line in lines]
-    for line, row in enumerate(rows, first + 2):
-        if len(row) != len(names):
-            hint = "separate columns by ',', write decimals with '.', give every column a field; line 1 is the header"
-            problem = f"found {counted(len(row), 'field')} under {counted(len(names), 'name')}"
-            refuse(path, f"line {line}", problem, _separator_hint(path) or hint)
-    if first == 0 and not any(map(_is_number, rows[0])):
-        problem = f"holds no number, found {','.join(rows[0])!r}"
-        refuse(path, "line 2", problem, header_hint(path) or "remove the row of units")
-    return rows
+def _separator_hint(first: str, last: str) -> str | None:
+    other = next((mark for mark in (";", "\t") if mark in first and mark in last), None)
+    return f"separate columns by ',' (not {other!r}), decimals by '.'" if other else None
 
 
 def _check_names(path: Path, names: Sequence[str], required: Sequence[str], gaps: Sequence[str]) -> None:
@@ -401,24 +441,10 @@ def _check_names(path: Path, names: Sequence[str], required: Sequence[str], gaps
             refuse(path, f"{line}column {name!r}", f"stands there {names.count(name)} times", "keep one of them")
 
 
-def numbers(
-    path: Path, name: str, lines: Sequence[int], texts: Sequence[str], gaps: bool, dates: bool, decimal: str = "."
-) -> Float[np.ndarray, " time"]:
-    """The numbers of one column, or its dates, at full speed; where that fails, field by field to find the mistake."""
-    with suppress(ValueError):
-        values = np.array([float(text) if text else math.nan for text in texts])
-        plain = np.isfinite(values).all() if not gaps else not np.isinf(values).any()
-        if plain and decimal == "." and "_" not in "".join(texts):
-            return values
-    dates = dates and math.isinf(number(texts[0], decimal))
-    values = moments(texts) if dates else np.array([number(text, decimal) for text in texts])
+def _wrong(values: np.ndarray, gaps: bool) -> int | None:
+    """Place of the first value that is no number; NaN is a missing one where `gaps` allow it."""
     wrong = np.flatnonzero(np.isinf(values) | (np.isnan(values) & (not gaps)))
-    if wrong.size:
-        where, text = f"line {lines[int(wrong[0])]}, column {name!r}", repr(texts[int(wrong[0])])
-        if dates:
-            refuse(path, where, f"found {text}", "write seconds, or dates such as 2026-11-03T23:59:40.010")
-        _no_number(path, where, text, math.isnan(values[wrong[0]]), gaps)
-    return values
+    return int(wrong[0]) if wrong.size else None
 
 
 def _no_number(path: Path, where: str, text: str, missing: bool, gaps: bool) -> NoReturn:
@@ -426,32 +452,6 @@ def _no_number(path: Path, where: str, text: str, missing: bool, gaps: bool) -> 
     refuse(path, where, f"found {text}", hint + ("; time and inputs are never empty" * missing))
 
 
-def _enough(path: Path, rows: int) -> None:
-    """Refuse a table without motion."""
-    if rows < 2:
-        refuse(path, "the file", f"found {counted(rows, 'row')}", "write 2 rows or more")
-
-
-def _stack(path: Path, columns: Mapping[str, Any], gaps: Sequence[str], dates: bool) -> Table:
-    """Columns of numbers side by side, checked as those of a CSV file are."""
-    rows = np.size(next(iter(columns.values())))
-    _enough(path, rows)
-    out = []
-    for name, values in columns.items():
-        if dates and name not in gaps and values.dtype.kind in "MmOSU":
-            values = dated(values)
-        if values.dtype.kind not in "iuf":
-            refuse(path, f"column {name!r}", f"holds {values.dtype}, no numbers", "store it as 64-bit floating point")
-        if values.shape != (rows,):
-            shape = " x ".join(map(str, values.shape))
-            refuse(
-                path, f"column {name!r}", f"is {shape or 1}, the first has {rows} rows", "give all columns one length"
-            )
-        values = values.astype(np.float64)
-        wrong = np.flatnonzero(np.isinf(values) | (np.isnan(values) & (name not in gaps)))
-        if wrong.size:
-            value = values[wrong[0]]
-            where = place(path, name, int(wrong[0]))
-            _no_number(path, where, f"{value:g}", bool(np.isnan(value)), name in gaps)
-        out.append(values)
-    return np.stack(out, -1)
+def _too_few(path: Path, where: str, rows: int) -> NoReturn:
+    hint = "write 2 rows or more" if where == "the file" else "write a header and 2 rows or more"
+    refuse(path, where, f"found {counted(rows, 'row')}", hint)

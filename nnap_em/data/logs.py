@@ -13,7 +13,7 @@ from jaxtyping import Float, Int
 from ..numerics.digits import counted
 from .constant import FULL
 from .dataset import DataError, Dataset, pad
-from .formats import column_names, log_files, place, read_table, refuse, untimed
+from .formats import check_size, columns_of, header_hint, log_files, place, refuse, table_of, untimed
 from .held import hold
 from .held import repeats as held_rows
 from .missing import interpolated
@@ -253,11 +253,12 @@ class _Sequence(NamedTuple):
 
 
 def _read_table(path: Path, rig: Rig) -> _Table:
-    names = column_names(path)
-    clock = ("time",) if "time" in names or untimed(path, names) else ()
-    table = read_table(path, (*clock, *rig.logged_inputs), rig.measured)
-    for name in filter(is_episode, names):
-        if changes := np.flatnonzero(np.diff(read_table(path, (name,))[:, 0])).tolist():
+    check_size(path)
+    content = table_of(path)
+    clock = ("time",) if "time" in content.names or header_hint(path) or untimed(content.names) else ()
+    table = columns_of(content, (*clock, *rig.logged_inputs), rig.measured)
+    for name in filter(is_episode, content.names):
+        if changes := np.flatnonzero(np.diff(columns_of(content, (name,))[:, 0])).tolist():
             hint = "`nnap-em import` it: each becomes a sequence"
             refuse(path, place(path, name, changes[0] + 1), "another episode begins", hint)
     if not clock:

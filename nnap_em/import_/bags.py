@@ -90,8 +90,8 @@ class _Columns:
     def track(self, path: Path, topic: str) -> Track:
         """The messages, in the order of the clock that is taken."""
         columns = [np.array(values) for values in self.values]
-        clock = choose(path, topic, np.array(self.t), _nanoseconds(*columns[len(self.paths) :]))
-        return clock.track(zip(self.paths, columns[: len(self.paths)], strict=True))
+        stamp = _nanoseconds(*columns[len(self.paths) :])
+        return choose(path, topic, np.array(self.t), stamp, dict(zip(self.paths, columns, strict=False)))
 
 
 def read(path: Path, fields: Mapping[str, Sequence[str]]) -> Recording:
@@ -163,46 +163,39 @@ def _opened(path: Path) -> Iterator[_Log]:
 def _mcap(path: Path) -> Iterator[_Log]:
     """An MCAP file, whose head is read where its end is missing [mcap.dev/spec]."""
     from mcap.exceptions import EndOfFile
-    from mcap.reader import SeekingReader
-    from mcap.records import Channel as ChannelRecord
-    from mcap.records import Message, Schema
-    from mcap.stream_reader import StreamReader
+    from mcap.reader import NonSeekingReader, SeekingReader
 
     with path.open("rb") as file:
-        log, schemas = _Log(), {}
+        log = _Log()
         try:
             summary = SeekingReader(file).get_summary()
         except Exception:  # damaged, or cut short
             summary = None
         file.seek(0)
 
-        def channel(record: Any) -> Channel:
-            schema = schemas.get(record.schema_id)
-            kind = f"{schema.name if schema else 'no schema'}, {record.message_encoding}"
-            return Channel(record.topic, kind, _decoder(record.message_encoding, schema))
-
-        if summary is not None:
-            schemas |= summary.schemas
-            log.counts = dict(summary.statistics.channel_message_counts) if summary.statistics else {}
-            known = {0, *schemas}
-            log.channels |= {c.id: channel(c) for c in summary.channels.values() if c.schema_id in known}
+        def add(schema: Any, channel: Any) -> None:
+            kind = f"{schema.name if schema else 'no schema'}, {channel.message_encoding}"
+            decode = _decoder(channel.message_encoding, schema)
+            log.channels[channel.id] = Channel(channel.topic, kind, decode)
 
         def messages() -> Iterator[tuple[int, int, bytes]]:
             count = 0
             try:
-                for record in StreamReader(file, validate_crcs=True).records:
-                    if isinstance(record, Schema):
-                        schemas[record.id] = record
-                    elif isinstance(record, ChannelRecord) and record.id not in log.channels:
-                        log.channels[record.id] = channel(record)
-                    elif isinstance(record, Message):
-                        count += 1
-                        yield record.channel_id, record.log_time, record.data
+                for schema, channel, message in NonSeekingReader(file, True).iter_messages(log_time_order=False):
+                    if channel.id not in log.channels:
+                        add(schema, channel)
+                    count += 1
+                    yield channel.id, message.log_time, message.data
             except (EndOfFile, struct.error):
                 if file.read(1):
                     raise
                 log.notes = (f"the file is cut short: what is whole was read, {count} messages",)
 
+        if summary is not None:
+            log.counts = dict(summary.statistics.channel_message_counts) if summary.statistics else {}
+            for channel in summary.channels.values():
+                if channel.schema_id in (0, *summary.schemas):
+                    add(summary.schemas.get(channel.schema_id), channel)
         log.messages = messages()
         yield log
 

@@ -1,8 +1,7 @@
-"""The times of a topic: their order, stamps of other clocks, and which clock to take."""
+"""The times of topics: their order, stamps of other clocks, which clock to take, and one for all of a log."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int, Real
@@ -10,42 +9,17 @@ from jaxtyping import Float, Int, Real
 from ..data.dataset import Array
 from ..data.units import UNITS
 from ..numerics.digits import counted
-from .recording import SECOND, Lag, Track, refuse
+from .recording import SECOND, Lag, Recording, Track, refuse
 
 BACK = 1.0
 """Seconds that a log may be out of order: writers of several threads are, a clock that was set back is more."""
-
-
-class Clock(NamedTuple):
-    """Times that rise, and the messages that they belong to."""
-
-    t: Int[np.ndarray, " kept"]
-    """ns."""
-    order: Int[np.ndarray, " message"] | None
-    """Indices of the used messages, in the order of their times; None: all, as they are."""
-    first: Int[np.ndarray, " kept"] | None
-    """Place in `order` of the first message of each time; None: each message has its own."""
-    name: str
-    notes: tuple[str, ...]
-    lag: Lag = ()
-
-    def track(self, columns: Iterable[tuple[str, Float[np.ndarray, " every"]]]) -> Track:
-        """These columns at these times."""
-        return Track(self.t, {name: self.take(y) for name, y in columns}, self.name, self.notes, self.lag)
-
-    def take(self, values: Float[np.ndarray, " every"]) -> Float[np.ndarray, " kept"]:
-        """A column at these times: the last number of the messages at one time, NaN where none has one."""
-        values = values if self.order is None else values[self.order]
-        if self.first is None:
-            return values
-        last = np.maximum.reduceat(np.where(np.isfinite(values), np.arange(values.size), -1), self.first)
-        return np.where(last >= self.first, values[last], np.nan)
+Values = Mapping[str, Float[np.ndarray, " message"]]
 
 
 def choose(
-    path: Path, topic: str, log: Int[np.ndarray, " message"], stamp: Int[np.ndarray, " message"] | None
-) -> Clock:
-    """Header stamps where they are there, rise and are of the log's clock; log times otherwise [ns].
+    path: Path, topic: str, log: Int[np.ndarray, " message"], stamp: Int[np.ndarray, " message"] | None, values: Values
+) -> Track:
+    """Columns at header stamps where they are there, rise and are of the log's clock; at log times otherwise [ns].
 
     Raises DataError where there is no time at all, or it runs backwards.
     """
@@ -55,24 +29,28 @@ def choose(
         used = order[trusted(stamp[order])]
         reason = _odd(stamp[used], log[used])
         if reason is None:
-            return _clock(stamp, used, "header stamp", "message")._replace(lag=lags(stamp[used], log[used]))
+            track = _track(stamp, used, values, "header stamp", "message")
+            return track._replace(lag=lags(stamp[used], log[used]))
         notes = (f"header stamps {reason}: log times are taken",)
-    clock = rising(path, f"topic {topic!r}", log, "log time", "message")
-    return clock._replace(notes=notes + clock.notes, lag=((int(log[0]), 0),))
+    track = rising(path, f"topic {topic!r}", log, values, "log time", "message")
+    return track._replace(notes=notes + track.notes, lag=((int(log[0]), 0),))
 
 
-def rising(path: Path, where: str, t: Int[np.ndarray, " m"], name: str, noun: str = "row") -> Clock:
-    """Times [ns] in their order, where they stand or are a little out of it; refused where they are no clock."""
+def rising(
+    path: Path, where: str, t: Int[np.ndarray, " message"], values: Values, name: str, noun: str = "row"
+) -> Track:
+    """Columns in the order of their times [ns], where these are a little out of it; refused where they are no clock."""
     kept = trusted(t)
-    if _behind(used := t[kept]) > BACK * SECOND:
+    used = t[kept]
+    if np.max(np.maximum.accumulate(used) - used) > BACK * SECOND:
         k = int(np.argmin(np.diff(used)))
         hint = "the clock was set back there: cut the file at that place, or take out a row with a wrong time"
         amount = float(used[: k + 1].max() - used[k + 1]) * 1e-9
         refuse(path, where, f"time runs backwards at {noun} {kept[k + 1] + 1}, by {amount:.6g} s", hint)
-    if t.size > 1 and t[kept].min() == t[kept].max():
+    if t.size > 1 and used.min() == used.max():
         hint = "record with stamps, or write the time [s] of each"
-        refuse(path, where, f"has no stamps: all {kept.size} {noun}s are at {t[kept[0]] * 1e-9:g} s", hint)
-    return _clock(t, kept, name, noun)
+        refuse(path, where, f"has no stamps: all {kept.size} {noun}s are at {used[0] * 1e-9:g} s", hint)
+    return _track(t, kept, values, name, noun)
 
 
 def nanoseconds(
@@ -103,8 +81,7 @@ def nanoseconds(
     if t.dtype.kind in "iu":
         each = round(UNITS[unit] * SECOND)
         return np.clip(t.astype(np.int64), -latest // each, latest // each) * each
-    t = t * (UNITS[unit] * SECOND)
-    return np.round(np.clip(t, -latest, latest, out=t), out=t).astype(np.int64)
+    return np.round(np.clip(t * (UNITS[unit] * SECOND), -latest, latest)).astype(np.int64)
 
 
 def in_a_row(t: Int[np.ndarray, " row"], episode: Float[np.ndarray, " row"]) -> Int[np.ndarray, " row"]:
@@ -138,31 +115,71 @@ def lags(stamp: Int[np.ndarray, " message"], log: Int[np.ndarray, " message"]) -
     return tuple((int(np.median(stamp[k])), int(np.median(stamp[k] - log[k]))) for k in parts)
 
 
-def _clock(t: Int[np.ndarray, " m"], order: Int[np.ndarray, " used"], name: str, noun: str) -> Clock:
-    """One time for the messages of each time, in their order; notes about those that are moved or left out."""
+def on_one_clock(recording: Recording, dt: float, shifted: Collection[str]) -> Recording:
+    """The recording with its topics on the clock of the log, where their clocks differ by what is no latency.
+
+    A stamp is behind the log time of its message by the latency of the recorder: never ahead of it, by no more than
+    0.25 s, and by the same at the end as at the start, to a row each.  Within this, a difference of more than a row is
+    reported, save for topics in `shifted`.
+    """
+    lag_of = {topic: np.array(track.lag, float).T for topic, track in recording.tracks.items() if track.lag}
+    clocks = {track.clock for track in recording.tracks.values() if not track.lag}
+    if len(clocks) > 1:
+        names = " and ".join(repr(name) for name in sorted(clocks))
+        return recording._replace(notes=(*recording.notes, f"times are of {names}: are these of one clock?"))
+    if len(lag_of) < 2:
+        return recording
+    at = np.unique(np.concatenate([stamps for stamps, _ in lag_of.values()]))
+    behind = {topic: -1e-9 * np.interp(at, *lag) for topic, lag in lag_of.items()}
+    late = np.stack([*behind.values()])
+    apart = late.max(0) - late.min(0)
+    if apart.max() <= dt:
+        return recording
+    words = {
+        topic: f"{topic} are {abs(np.median(each)):.3f} s {'behind' if np.median(each) > 0 else 'ahead of'}"
+        for topic, each in behind.items()
+        if np.abs(each).max() > dt
+    }
+    note = f"header stamps of {', those of '.join(words.values())} the clock of the log"
+    latency = 0.25  # longest one of a recorder [s]: stamps that are more behind the log times are of another clock
+    if late.min() < -dt or late.max() > latency or np.ptp(apart) > dt:
+        tracks = dict(recording.tracks)
+        for topic in words:
+            t = tracks[topic].t
+            tracks[topic] = tracks[topic]._replace(t=t - np.round(np.interp(t, *lag_of[topic])).astype(np.int64))
+        note += ": taken out, all topics are on the clock of the log"
+        return recording._replace(tracks=tracks, notes=(*recording.notes, note))
+    if set(words) <= set(shifted):
+        return recording
+    hint = ", ".join(f"--shift {topic}={np.median(behind[topic]):.3g}" for topic in words)
+    note += f", not those of other topics: where this is no latency, {hint} takes it out"
+    return recording._replace(notes=(*recording.notes, note))
+
+
+def _track(t: Int[np.ndarray, " m"], order: Int[np.ndarray, " used"], values: Values, name: str, noun: str) -> Track:
+    """The last number of each column at each time, NaN where none has one; notes about messages moved or left out."""
     notes: list[str] = []
-    if amount := _behind(t[order]):
-        back = counted(int(np.sum(np.diff(t[order]) < 0)), noun)
-        notes.append(f"{back} out of order by up to {amount * 1e-9:.2g} s: sorted")
-        order = order[np.argsort(t[order], kind="stable")]
     if order.size < t.size:
         wild = np.delete(t, order)
         amount, middle = counted(wild.size, noun), float(np.median(t[order])) * 1e-9
         place = f"the first at {wild[0] * 1e-9:.10g} s, {abs(wild[0] * 1e-9 - middle):.3g} s from the others"
         notes.append(f"{amount} with a stamp of another clock dropped ({place})")
-    as_is = order.size == t.size and bool((order[1:] > order[:-1]).all())
-    t, places = (t, None) if as_is else (t[order], order)
-    if (t[1:] > t[:-1]).all():
-        return Clock(t, places, None, name, tuple(notes))
-    first = np.append(0, np.flatnonzero(np.diff(t) > 0) + 1)
-    same = counted(t.size - first.size, noun)
-    notes.append(f"{same} with the time of the next one: the last value of each column is taken")
-    return Clock(t[first], places, first, name, tuple(notes))
+    if back := int(np.sum(np.diff(t[order]) < 0)):
+        amount = float(np.max(np.maximum.accumulate(t[order]) - t[order])) * 1e-9
+        notes.append(f"{counted(back, noun)} out of order by up to {amount:.2g} s: sorted")
+        order = order[np.argsort(t[order], kind="stable")]
+    t = t[order]
+    first = np.flatnonzero(np.append(True, np.diff(t) > 0))
+    if same := t.size - first.size:
+        amount = counted(same, noun)
+        notes.append(f"{amount} with the time of the next one: the last value of each column is taken")
 
+    def last(y: Float[np.ndarray, " used"]) -> Float[np.ndarray, " kept"]:
+        known = np.maximum.reduceat(np.where(np.isfinite(y), np.arange(y.size), -1), first)
+        return np.where(known >= first, y[known], np.nan)
 
-def _behind(t: Int[np.ndarray, " message"]) -> int:
-    """Largest amount by which a time is behind an earlier one [ns]."""
-    return 0 if (t[1:] >= t[:-1]).all() else int(np.max(np.maximum.accumulate(t) - t))
+    columns = {column: last(y[order]) if same else y[order] for column, y in values.items()}
+    return Track(t[first], columns, name, tuple(notes))
 
 
 def _odd(stamp: Int[np.ndarray, " message"], log: Int[np.ndarray, " message"]) -> str | None:

@@ -4,7 +4,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from ..data.dataset import DataError
-from . import bags, hdf5_file, table_file, text_file
+from . import bags, hdf5_file, table_file
 from .recording import Address, Reader, Recording
 
 readers: dict[str, Reader] = {
@@ -13,13 +13,7 @@ readers: dict[str, Reader] = {
     ".bag": bags,
     ".h5": hdf5_file,
     ".hdf5": hdf5_file,
-    ".csv": table_file,
-    ".parquet": table_file,
-    ".mat": table_file,
-    ".txt": text_file,
-    ".tsv": text_file,
-    ".lvm": text_file,
-    **dict.fromkeys(text_file.SHEETS, text_file),
+    **dict.fromkeys((".csv", ".parquet", ".mat", ".txt", ".tsv", ".lvm", *table_file.SHEETS), table_file),
 }
 """Reader by the end of the name; for another kind of file, add one that has `topics` and `read`."""
 _ELSEWHERE = {
@@ -41,7 +35,7 @@ def reader(path: Path) -> Reader:
         raise DataError(f"{path}: {suffix} is not read; {_ELSEWHERE[suffix].format(path=path, stem=path.stem)}")
     if suffix not in readers:
         raise DataError(f"{path}: logs end in {', '.join(readers)}; rename it, or write one of these")
-    return text_file if suffix == ".csv" and text_file.foreign(path) else readers[suffix]
+    return readers[suffix]
 
 
 def read(path: Path, addresses: Iterable[Address]) -> Recording:

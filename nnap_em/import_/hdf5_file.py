@@ -52,20 +52,16 @@ def _track(path: Path, group: Any, paths: Sequence[str]) -> Track:
         names = ", ".join(group) or "nothing"
         hint = "name the data set of its times `time` [s], or give it an attribute axis = 'time'"
         refuse(path, where, f"has no time axis (holds {names})", hint)
-    clock = rising(path, f"data set {axis.name!r}", _nanoseconds(path, axis), axis.name.rpartition("/")[2])
-    return clock.track((each, _column(group, each)) for each in paths)
+    values = {each: _column(group, each) for each in paths}
+    return rising(path, f"data set {axis.name!r}", _nanoseconds(path, axis), values, axis.name.rpartition("/")[2])
 
 
 def _column(group: Any, field: str) -> Float[np.ndarray, " row"]:
-    """One column, read in blocks: neighbours of a wide data set are not kept."""
+    """One column, of one number a row or of a row of numbers."""
     field = field if field in group else named_unit(field, brackets=True)[0]
     name, _, index = (field, "", "") if field in group else field.removesuffix("]").rpartition("[")
     data = group[name]
-    if data.ndim == 1:
-        return data[:].astype(np.float64)
-    block = 2**18  # rows of a wide data set that are read at once
-    blocks = range(0, data.shape[0], block)
-    return np.concatenate([data[k : k + block, int(index)].astype(np.float64) for k in blocks])
+    return np.asarray(data[:] if data.ndim == 1 else data[:, int(index)], np.float64)
 
 
 def _nanoseconds(path: Path, axis: Any) -> Int[np.ndarray, " row"]:

@@ -13,8 +13,8 @@ from ..data.dataset import DataError
 from ..data.rig import SMOOTH, Rig, nearest
 from ..data.units import other_unit
 from ..numerics.digits import counted
+from .clock import on_one_clock
 from .columns import in_unit, resolve
-from .common_clock import on_one_clock
 from .declared import LONGEST, Plan
 from .files import read, reader
 from .readings import as_taken

@@ -1,44 +1,186 @@
-"""CSV, Parquet and MAT files: one topic without a name, whose fields are the columns."""
+"""Tables: CSV and other texts, workbooks, Parquet and MAT files; a topic for each clock, whose fields are columns."""
 
-from collections.abc import Mapping, Sequence
+import math
+import re
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import pairwise
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Int
 
-from ..data.formats import column_names, read_log, refuse, untimed
+from ..data.dataset import DataError
+from ..data.formats import (
+    ArrayTable,
+    Rows,
+    TextTable,
+    columns_of,
+    csv_table,
+    header_hint,
+    split,
+    table_of,
+    text_lines,
+    unreadable,
+    untimed,
+)
 from ..data.units import clock_of, is_episode, named_unit
 from .clock import in_a_row, nanoseconds, rising
-from .recording import SECOND, UNTIMED, Recording, Topic, Track
+from .recording import EXTRA, SECOND, UNTIMED, Recording, Topic, Track, refuse
+from .text_file import CODESYS, layout, plain
+
+SHEETS = (".xlsx", ".xls", ".ods")
+"""Ends of the names of workbooks."""
+_TICKS_1970 = 116_444_736_000_000_000
+"""1970 in ticks of 100 ns since 1601."""
+
+
+class Block(NamedTuple):
+    """Columns with one clock."""
+
+    table: TextTable | ArrayTable
+    columns: tuple[str, ...]
+    clock: str | None
+    day: str | None = None
+    """Column of the dates beside the times."""
+    rows: Rows = slice(None)
+    unit: str = ""
+    """Unit of the times; empty: by their name or size."""
+    dt: float = math.nan
+    """Interval of the rows [s], of a table without times that states it."""
+
+    def times(self) -> Int[np.ndarray, " row"]:
+        """The times [ns], with the dates beside them; ticks in whole numbers, of which a float holds 16 digits."""
+        table, clock = self.table, self.clock or ""
+        t = columns_of(table, (clock,), dates=True, rows=self.rows)[:, 0]
+        if self.unit == "ticks" and isinstance(table, TextTable):
+            every = zip(table.texts(clock, self.rows), t, strict=True)
+            return np.array([100 * (int(text if text.isdecimal() else x) - _TICKS_1970) for text, x in every])
+        days = (lambda: columns_of(table, (self.day or "",), dates=True, rows=self.rows)[:, 0]) if self.day else None
+        return nanoseconds(table.path, f"column {clock!r}", t, self.unit or named_unit(clock)[1], days)
+
+    def track(self, names: Sequence[str]) -> Track:
+        """Some of the columns at their times."""
+        episode = [name for name in self.columns if is_episode(name)][:1]
+        read = columns_of(self.table, (*filter(None, [self.clock]), *episode), names, dates=True, rows=self.rows)
+        values = dict(zip(names, read[:, read.shape[1] - len(names) :].T, strict=True))
+        timed = self.clock is not None
+        step = SECOND * (1.0 if math.isnan(self.dt) else self.dt)
+        t = self.times() if timed else np.round(step * np.arange(len(read))).astype(np.int64)
+        t = in_a_row(t, read[:, int(timed)]) if episode else t
+        if not timed and math.isnan(self.dt):
+            return Track(t, values, UNTIMED, ())
+        name = re.sub(r" \(\d+\)$", "", self.clock or "Delta_X")  # several clocks that are called alike
+        return rising(self.table.path, f"column {self.clock!r}", t, values, name)
 
 
 def topics(path: Path) -> tuple[Topic, ...]:
-    """The columns, save those of the time."""
-    names = column_names(path)
-    clock = _clock(path, names)
-    kind = f"table, time in column {clock[0]!r}" if clock else "table without times"
-    return (Topic("", kind, None, tuple(name for name in names if name not in clock)),)
+    """A topic for each clock; one alone has no name."""
+    return tuple(
+        Topic(name, f"table, time in column {block.clock!r}" if block.clock else "table without times", None,
+              block.columns)
+        for name, block in _blocks(path).items()
+    )  # fmt: skip
 
 
 def read(path: Path, fields: Mapping[str, Sequence[str]]) -> Recording:
     """These columns; an empty field is NaN."""
-    names = column_names(path)
-    clock, episode = _clock(path, names), [name for name in names if is_episode(name)][:1]
-    table = read_log(path, (*clock[:1], *episode), fields[""])
-    first = len(clock[:1]) + len(episode)
-    values = dict(zip(fields[""], table[:, first:].T, strict=True))
-    t = SECOND * np.arange(len(table))
-    if clock:
-        days = (lambda: read_log(path, clock[1:], ())[:, 0]) if clock[1:] else None
-        t = nanoseconds(path, f"column {clock[0]!r}", table[:, 0], named_unit(clock[0])[1], days)
-    t = in_a_row(t, table[:, first - 1]) if episode else t
-    if not clock:
-        return Recording(path, {"": Track(t, values, UNTIMED, ())})
-    return Recording(path, {"": rising(path, f"column {clock[0]!r}", t, clock[0]).track(values.items())})
+    blocks = _blocks(path)
+    return Recording(path, {topic: blocks[topic].track(names) for topic, names in fields.items()})
 
 
-def _clock(path: Path, names: Sequence[str]) -> tuple[str, ...]:
-    """The column that is the time, and that of its dates; nothing where no name is like one."""
-    column, day = clock_of(names)
-    if column is None and (hint := untimed(path, names)):
-        refuse(path, "the file", f"has no column of times (found {', '.join(names[:6])})", hint)
-    return tuple(filter(None, (column, day)))
+def _blocks(path: Path) -> dict[str, Block]:
+    """The columns by their clocks."""
+    if path.suffix.lower() in (".parquet", ".mat"):
+        return {"": _whole(table_of(path))}
+    lines = _sheet(path) if path.suffix.lower() in SHEETS else text_lines(path)
+    blocks = [*(_codesys if lines[0].startswith(CODESYS) else _parts)(path, lines)]
+    if not blocks:
+        hint = header_hint(path) or "write a header, then rows of numbers"
+        refuse(path, "the file", "holds no column of numbers under a name", hint)
+    return {f"clock {k}" if len(blocks) > 1 else "": block for k, block in enumerate(blocks, 1)}
+
+
+def _whole(table: TextTable | ArrayTable) -> Block:
+    """All columns of a table with one clock, or none."""
+    clock, day = clock_of(table.names)
+    if clock is None:
+        _refuse_clock(table, header_hint(table.path) or untimed(table.names))
+    return Block(table, tuple(name for name in table.names if name not in (clock, day, "")), clock, day)
+
+
+def _refuse_clock(table: TextTable | ArrayTable, hint: str | None) -> None:
+    """Refuse a table whose times may have a name that is not known; one without times has no hint."""
+    if hint:
+        refuse(table.path, "the file", f"has no column of times (found {', '.join(table.names[:6])})", hint)
+
+
+def _sheet(path: Path) -> list[str]:
+    """The rows of the first sheet of a workbook, fields separated by tabulators, dates as ISO 8601."""
+    try:
+        import python_calamine
+    except ImportError:
+        raise DataError(f"{path}: workbooks cannot be read without python-calamine; {EXTRA}") from None
+    try:
+        rows = python_calamine.CalamineWorkbook.from_path(path).get_sheet_by_index(0).to_python(skip_empty_area=False)
+    except PermissionError as error:
+        raise unreadable(path, error) from None
+    except Exception as error:  # whatever the parser raises on bytes that are no workbook
+        raise DataError(f"{path}: no workbook, or damaged ({error}); save the sheet as CSV UTF-8") from None
+    text = lambda cell: cell.isoformat() if hasattr(cell, "isoformat") else " ".join(str(cell).split())  # noqa: E731
+    return ["\t".join(map(text, row)) for row in rows] or [""]
+
+
+def _parts(path: Path, lines: Sequence[str]) -> Iterator[Block]:
+    """The columns of a text table, in one block for each column of times; those with the same times together."""
+    found = layout(lines)
+    if found is None and path.suffix.lower() != ".csv":
+        return
+    if found is None or plain(lines, found):
+        yield _whole(csv_table(path, lines))
+        return
+    rows, names = lines[found.first :], _different(found.names)
+    end = next((k for k, line in enumerate(rows) if line.strip("\t ,;") == "EOF"), len(rows))
+    table = TextTable(path, names, rows[:end], found.first + 1, found.marks, exact=False)
+    if not found.clocks:
+        filled = np.array([k for k, line in enumerate(table.lines) if line.strip()])
+        columns = tuple(filter(None, names))
+        _refuse_clock(table, untimed(columns) if math.isnan(found.dt) else None)
+        yield Block(table, columns, None, rows=filled, dt=found.dt)
+        return
+    day = clock_of(found.names)[1]
+    parts: dict[bytes, list[int]] = {}
+    for clock, (start, stop) in zip(found.clocks, pairwise((0, *found.clocks[1:], len(names))), strict=True):
+        inside = [i for i in range(start, stop) if names[i] and i not in found.clocks and names[i] != day]
+        if inside:
+            parts.setdefault(table.values[:, clock].tobytes(), [clock]).extend(inside)
+    for clock, *inside in parts.values():
+        filled = np.flatnonzero((~np.isnan(table.values[:, [clock, *inside]])).any(axis=1))
+        yield Block(table, tuple(names[i] for i in inside), names[clock], day, filled, found.unit)
+
+
+def _different(names: Sequence[str]) -> tuple[str, ...]:
+    """Names with a number behind those that stood there before."""
+    twice, out = Counter[str](), []
+    for name in names:
+        twice[name] += 1
+        out.append(f"{name} ({twice[name] - 1})" if name and twice[name] > 1 else name)
+    return tuple(out)
+
+
+def _codesys(path: Path, lines: Sequence[str]) -> Iterator[Block]:
+    """CODESYS trace: for each variable `0.Variable; name`, then rows `; time; value`; bit 5 of `Flags`: us, else ms."""
+    name, unit = "", "ms"
+    parts: dict[str, tuple[int, list[str]]] = {}
+    for at, line in enumerate(lines, 1):
+        key, *rest = split(line, ";")
+        if not key and len(rest) == 2:
+            parts.setdefault(name, (at, []))[1].append(";".join(rest))
+        elif key.endswith("Variable"):
+            name = " ".join(rest)
+        elif key == "Flags" and rest and rest[0].isdecimal() and int(rest[0]) & 32:
+            unit = "us"
+    for name, (first, rows) in parts.items():
+        table = TextTable(path, ("time", name), rows, first, (";", "."), exact=False)
+        yield Block(table, (name,), "time", unit=unit)

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..data.dataset import DataError
-from ..data.formats import csv_fields, header_hint, number, place, refuse
+from ..data.formats import csv_table, header_hint, place, refuse
 from ..data.noise import reading_noise
 from ..data.rig import SystemSpec, dotted_key, toml_key, toml_text
 from ..data.units import UNITS, named_unit, parameter_unit, si
@@ -104,10 +104,9 @@ def numbers(path: Path) -> dict[str, Float[np.ndarray, " time"]]:
     """The columns of a CSV file that hold numbers; NaN where a field is empty."""
     if path.suffix.lower() != ".csv":
         raise DataError(f"{path}: its name does not end in .csv; give a CSV file")
-    names, rows = csv_fields(path)
-    columns = {}
-    for name, texts in zip(names, zip(*rows, strict=True), strict=True):
-        columns[name] = np.array([number(text) for text in texts])
+    table, columns = csv_table(path), {}
+    for name, values in zip(table.names, table.values.T, strict=True):
+        columns[name] = values
         if np.isinf(columns[name]).any():
             del columns[name]
             if meaning(name).kind == "time":

@@ -17,10 +17,13 @@ from ..data.dataset import DataError
 from ..data.formats import unreadable
 from .clock import choose
 from .objects import flatten, pick
-from .recording import EXTRA, OTHER, Recording, Topic, Track, refuse
+from .recording import EXTRA, OTHER, Recording, Topic, refuse
 
 SAMPLES = 20
 """Messages of a channel that are looked at for its fields: not every message needs to have them all."""
+
+
+Decode = Callable[[bytes], Any]
 
 
 class Channel(NamedTuple):
@@ -29,12 +32,8 @@ class Channel(NamedTuple):
     topic: str
     kind: str
     """Type and encoding, for people."""
-    decode: Callable[[bytes], Any]
-    """Message of its bytes; raises Unread where the encoding is unknown, and anything for damaged bytes."""
-
-
-class Unread(ValueError):
-    """An encoding or a schema that is not read, with the reason."""
+    decode: Decode | str
+    """Message of its bytes, which raises anything for damaged ones; a text: the reason why it is not read."""
 
 
 class _Log:
@@ -62,61 +61,53 @@ def topics(path: Path) -> tuple[Topic, ...]:
         for number, (name, kind, decode) in sorted(log.channels.items()):
             fields: list[str] = []
             count = log.counts.get(number, 0) if log.counts else None
-            try:
-                fields = [field for data in samples[number] for field in flatten(decode(data))]
-            except Unread as unread:
-                kind = f"{kind}: {unread}"
-            except Exception as error:
-                kind = f"{kind}: its messages do not fit their schema ({type(error).__name__})"
+            if isinstance(decode, str):
+                kind = f"{kind}: {decode}"
+            else:
+                try:
+                    fields = [field for data in samples[number] for field in flatten(decode(data))]
+                except Exception as error:
+                    kind = f"{kind}: its messages do not fit their schema ({type(error).__name__})"
             before = by_name.get(name, Topic(name, kind, 0, ()))
             total = None if count is None or before.messages is None else before.messages + count
             by_name[name] = Topic(name, kind, total, tuple(dict.fromkeys([*before.fields, *fields])))
     return tuple(by_name.values())
 
 
-class _Columns:
-    """Log times of one topic, and the numbers of each path, those of the header stamp last."""
-
-    def __init__(self, paths: Sequence[str], stamp: Sequence[str]):
-        self.paths, self.stamp = paths, stamp
-        self.t, self.values = array("q"), [array("d") for _ in (*paths, *stamp)]
-
-    def add(self, t: int, message: Any) -> None:
-        """One message."""
-        self.t.append(t)
-        for values, path in zip(self.values, (*self.paths, *self.stamp), strict=True):
-            values.append(pick(message, path))
-
-    def track(self, path: Path, topic: str) -> Track:
-        """The messages, in the order of the clock that is taken."""
-        columns = [np.array(values) for values in self.values]
-        stamp = _nanoseconds(*columns[len(self.paths) :])
-        return choose(path, topic, np.array(self.t), stamp, dict(zip(self.paths, columns, strict=False)))
-
-
 def read(path: Path, fields: Mapping[str, Sequence[str]]) -> Recording:
     """The numbers at these paths of these topics, in the order of their times."""
-    every: dict[str, _Columns] = {}
+    times: dict[str, array[int]] = {}
+    columns: dict[str, dict[str, array[float]]] = {}
+    stamps: dict[str, tuple[str, ...]] = {}
     with _opened(path) as log:
         for number, t, data in log.messages:
-            topic = log.channels[number].topic
+            topic, _, decode = log.channels[number]
             if topic not in fields:
                 continue
+            if isinstance(decode, str):
+                refuse(path, f"topic {topic!r}", decode, OTHER)
             try:
-                message = log.channels[number].decode(data)
-            except Unread as unread:
-                refuse(path, f"topic {topic!r}", str(unread), OTHER)
+                message = decode(data)
             except Exception as error:  # what the decoders raise on damaged bytes is open-ended
                 problem = f"a message does not fit its schema ({' '.join(str(error).split()) or type(error).__name__})"
                 hint = "the recorder wrote another type than it said: record again, or name another topic"
                 refuse(path, f"topic {topic!r}", problem, hint)
-            if topic not in every:
-                every[topic] = _Columns(fields[topic], _stamp(flatten(message)))
-            every[topic].add(t, message)
+            if topic not in times:
+                stamps[topic] = _stamp(flatten(message))
+                times[topic] = array("q")
+                columns[topic] = {at: array("d") for at in (*fields[topic], *stamps[topic])}
+            times[topic].append(t)
+            for at, values in columns[topic].items():
+                values.append(pick(message, at))
+        tracks = {}
         for topic in fields:
-            if topic not in every:
+            if topic not in times:
                 refuse(path, f"topic {topic!r}", "has no messages", "name another topic, or take the log out")
-        return Recording(path, {topic: every[topic].track(path, topic) for topic in fields}, log.notes)
+            values = {at: np.array(y) for at, y in columns[topic].items()}
+            stamp = _nanoseconds(*(values[at] for at in stamps[topic]))
+            wanted = {at: values[at] for at in fields[topic]}
+            tracks[topic] = choose(path, topic, np.array(times[topic]), stamp, wanted)
+        return Recording(path, tracks, log.notes)
 
 
 def _stamp(fields: Mapping[str, float]) -> tuple[str, ...]:
@@ -208,45 +199,40 @@ def _bag(path: Path) -> Iterator[_Log]:
 
     with AnyReader([path], default_typestore=get_typestore(Stores.LATEST)) as bag:
         log = _Log()
-        lacking = "its type is not in the file, nor one of ROS"
         for connection in bag.connections:
             kind = connection.msgtype
-            decode = functools.partial(bag.deserialize, typ=kind)
-            decode = decode if kind in bag.typestore.fielddefs else _refused(Unread(lacking))
+            known = kind in bag.typestore.fielddefs
+            lacking = "its type is not in the file, nor one of ROS"
+            decode = functools.partial(bag.deserialize, typ=kind) if known else lacking
             log.channels[connection.id] = Channel(connection.topic, kind, decode)
             log.counts[connection.id] = connection.msgcount
         log.messages = ((connection.id, t, data) for connection, t, data in bag.messages())
         yield log
 
 
-def _decoder(encoding: str, schema: Any) -> Callable[[bytes], Any]:
-    """Decoder of the messages of an MCAP file."""
+def _decoder(encoding: str, schema: Any) -> Decode | str:
+    """Decoder of the messages of an MCAP file, or the reason why there is none."""
+    form = schema.encoding if schema else "none"
     try:
-        if encoding not in _decoders:
-            raise Unread(f"encoding {encoding!r} is not read")
-        return _decoders[encoding](schema)
-    except Unread as error:
-        return _refused(error)
+        if encoding == "json":
+            return json.loads
+        if encoding == "cdr" and form in ("ros2msg", "ros2idl"):
+            return _cdr(schema)
+        if encoding == "protobuf":
+            from mcap_protobuf.decoder import DecoderFactory
+
+            if decode := DecoderFactory().decoder_for("protobuf", schema):
+                return decode
     except ImportError as error:
-        return _refused(Unread(f"it cannot be read without {error.name}; {EXTRA}"))
+        return f"it cannot be read without {error.name}; {EXTRA}"
     except Exception as error:
-        return _refused(Unread(f"its schema cannot be parsed ({error})"))
+        return f"its schema cannot be parsed ({error})"
+    return f"messages in {encoding!r} with a schema in {form!r} are not read"
 
 
-def _refused(reason: Unread) -> Callable[[bytes], Any]:
-    """A decoder that gives the reason why there is none."""
-
-    def refused(_: bytes) -> Any:
-        raise reason
-
-    return refused
-
-
-def _cdr(schema: Any) -> Callable[[bytes], Any]:
+def _cdr(schema: Any) -> Decode:
     from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 
-    if schema is None or schema.encoding not in ("ros2msg", "ros2idl"):
-        raise Unread(f"schema encoding {schema.encoding if schema else 'none'!r} of CDR messages is not read")
     package, _, kind = schema.name.partition("/")
     name = schema.name if kind.startswith("msg/") else f"{package}/msg/{kind}"  # some writers leave the middle out
     store, text = get_typestore(Stores.EMPTY), schema.data.decode()
@@ -256,18 +242,3 @@ def _cdr(schema: Any) -> Callable[[bytes], Any]:
         for part in filter(str.strip, text.split("=" * 80 + "\n")):
             store.register(get_types_from_idl(part.partition("\n")[2] if part.startswith("IDL: ") else part))
     return lambda data: store.deserialize_cdr(data, name)
-
-
-def _protobuf(schema: Any) -> Callable[[bytes], Any]:
-    from mcap_protobuf.decoder import DecoderFactory
-
-    if (decode := DecoderFactory().decoder_for("protobuf", schema)) is None:
-        raise Unread("protobuf without a protobuf schema is not read")
-    return decode
-
-
-_decoders: dict[str, Callable[[Any], Callable[[bytes], Any]]] = {
-    "cdr": _cdr,
-    "json": lambda schema: json.loads,
-    "protobuf": _protobuf,
-}

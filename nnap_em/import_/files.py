@@ -2,12 +2,13 @@
 
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 from ..data.dataset import DataError
 from . import bags, hdf5_file, table_file
-from .recording import Address, Reader, Recording
+from .recording import Address, Recording
 
-readers: dict[str, Reader] = {
+readers: dict[str, Any] = {
     ".mcap": bags,
     ".db3": bags,
     ".bag": bags,
@@ -15,7 +16,9 @@ readers: dict[str, Reader] = {
     ".hdf5": hdf5_file,
     **dict.fromkeys((".csv", ".parquet", ".mat", ".txt", ".tsv", ".lvm", *table_file.SHEETS), table_file),
 }
-"""Reader by the end of the name; for another kind of file, add one that has `topics` and `read`."""
+"""Module by the end of the name; for another kind of file, add one.  `topics(path)` lists topics and their fields
+without reading the whole file, `read(path, fields)` gives the numbers at some paths of some topics.
+"""
 _ELSEWHERE = {
     ".trace": "save the trace as *.trace.csv in CODESYS",
     ".svdx": "export it as CSV: TC3ScopeExportTool.exe svd={path} target={stem}.csv silent",
@@ -24,7 +27,7 @@ _ELSEWHERE = {
 """Commands that write a file that is not read as one that is."""
 
 
-def reader(path: Path) -> Reader:
+def reader(path: Path) -> Any:
     """The reader for a file; DataError where there is none, or no file."""
     if path.is_dir():
         raise DataError(f"{path}: is a folder; give the log in it")

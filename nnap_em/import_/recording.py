@@ -4,7 +4,7 @@ import functools
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -67,19 +67,6 @@ class Recording(NamedTuple):
     notes: tuple[str, ...] = ()
 
 
-@runtime_checkable
-class Reader(Protocol):
-    """A kind of file."""
-
-    def topics(self, path: Path) -> tuple[Topic, ...]:
-        """Topics of the file, without reading it all."""
-        ...
-
-    def read(self, path: Path, fields: Mapping[str, Sequence[str]]) -> Recording:
-        """The numbers at these paths of these topics, and nothing else."""
-        ...
-
-
 class Address(NamedTuple):
     """Address of a column."""
 
@@ -116,16 +103,15 @@ def last_word(path: str) -> str:
     return words[-1] if words else path
 
 
-def word_of(field: str) -> tuple[str, float]:
-    """The end of the path, and the SI units in the unit that stands behind it in brackets."""
-    name, unit = named_unit(field, brackets=True)
-    return last_word(name), si(unit)[1]
-
-
 def places(topics: Iterable[Topic]) -> list[tuple[Address, str]]:
-    """All numbers of a log, in SI units where these are known, with the last words of their paths."""
-    every = [(t.name, field, *word_of(field)) for t in topics for field in t.fields]
-    return [(Address(topic, field, None if size == 1 else size), word) for topic, field, word, size in every]
+    """All numbers of a log, scaled by units that stand in brackets behind them, with the last words of their paths."""
+    out = []
+    for topic in topics:
+        for field in topic.fields:
+            name, unit = named_unit(field, brackets=True)
+            size = si(unit)[1]
+            out.append((Address(topic.name, field, None if size == 1 else size), last_word(name)))
+    return out
 
 
 @functools.cache

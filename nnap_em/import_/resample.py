@@ -22,8 +22,8 @@ from .recording import UNTIMED, Address, Recording, Topic, Track, refuse
 from .segments import (
     FEWEST_ROWS,
     Gap,
-    Segment,
     Spans,
+    Stretch,
     covered,
     cut,
     gaps,
@@ -57,18 +57,6 @@ class TopicFacts(NamedTuple):
     """Largest deviation from the median of an interval that is no gap [s]."""
     gaps: tuple[Gap, ...] = ()
     notes: tuple[str, ...] = ()
-
-
-class Stretch(NamedTuple):
-    """Rows that become one file, or are dropped."""
-
-    start: float
-    """Time on the clock of the log [s]."""
-    rows: int
-    missing: Mapping[str, int]
-    """Empty fields of readings."""
-    why: str = ""
-    """Reason why it is dropped."""
 
 
 _Rows = tuple[Stretch, Mapping[str, Float[np.ndarray, " row"]]]
@@ -155,10 +143,11 @@ def _gridded(path: Path, rig: Rig, plan: Plan, signals: Mapping[str, Signal]) ->
     """Number of rows for which there are readings, and the sequences."""
     dt, readings = rig.dt, {name: signals[name] for name in rig.measured}
     end = max(float(s.t[-1]) for s in readings.values())
-    watched = {name: present(s) for name, s in _one_each(readings)}
+    watched = {name: present(s) for name, s in readings.items()}
     commanded = {
         name: present(s, hold(s, dt) if s.longest < math.inf else max(end - s.t[-1], 0.0))
-        for name, s in _one_each({name: signals[name] for name in rig.logged_inputs})
+        for name, s in signals.items()
+        if name in rig.logged_inputs
     }
     common = _common(path, signals, watched | commanded)
     _fine(path, readings, dt)
@@ -168,7 +157,7 @@ def _gridded(path: Path, rig: Rig, plan: Plan, signals: Mapping[str, Signal]) ->
     pieces = runs(covered([spans, common, *commanded.values()], 2 + len(commanded)), fastest, dt)
     shortest = FEWEST_ROWS if plan.shortest is None else max(math.ceil(plan.shortest / dt), 2)
     longest = max(round((plan.longest or LONGEST) / dt), 2 if plan.longest else 10 * FEWEST_ROWS)
-    sequences = [_sequence(segment, rig, plan, signals) for segment in cut(pieces, dt, shortest, longest)]
+    sequences = [_sequence(stretch, rig, plan, signals) for stretch in cut(pieces, dt, shortest, longest)]
     if all(stretch.why for stretch, _ in sequences):
         most = max((piece.rows for piece in pieces), default=0)
         problem = f"the longest stretch with all topics has {counted(most, 'row')}, a sequence needs {shortest} "
@@ -214,27 +203,18 @@ def _fine(path: Path, readings: Mapping[str, Signal], dt: float) -> None:
         refuse(path, "[sampling] dt", problem, other_unit(best.interval / dt, other))
 
 
-def _one_each(signals: Mapping[str, Signal]) -> Iterator[tuple[str, Signal]]:
-    """One of the columns that have the same times."""
-    known: list[Signal] = []
-    for name, s in signals.items():
-        if not any(s.topic == other.topic and np.array_equal(s.t, other.t) for other in known):
-            known.append(s)
-            yield name, s
-
-
-def _sequence(segment: Segment, rig: Rig, plan: Plan, signals: Mapping[str, Signal]) -> _Rows:
+def _sequence(stretch: Stretch, rig: Rig, plan: Plan, signals: Mapping[str, Signal]) -> _Rows:
     """Columns of a segment; dropped is one in which a column of readings is empty, which no other command accepts."""
-    if segment.why:
-        return Stretch(segment.start, segment.rows, {}, segment.why), {}
-    at = segment.start + rig.dt * np.arange(segment.rows)
+    if stretch.why:
+        return stretch, {}
+    at = stretch.start + rig.dt * np.arange(stretch.rows)
     value = straight if rig.input_hold == SMOOTH else averaged if plan.mean else held
     columns = {name: value(signals[name], at, rig.dt) for name in rig.logged_inputs}
     for name in rig.measured:
-        columns[name] = interpolated(signals[name], at, rig.dt, reach(signals[name], rig.dt))[0]
+        columns[name] = interpolated(signals[name], at, rig.dt, reach(signals[name], rig.dt))
     missing = {name: int(np.isnan(columns[name]).sum()) for name in rig.measured}
-    empty = [name for name, count in missing.items() if segment.rows - count < 2]
-    return Stretch(segment.start, segment.rows, missing, f"{empty[0]} has no reading there" if empty else ""), columns
+    why = next((f"{name} has no reading there" for name, count in missing.items() if stretch.rows - count < 2), "")
+    return stretch._replace(missing=missing, why=why), columns
 
 
 def _facts(
@@ -265,7 +245,7 @@ def _facts(
         1 / typical if typical > 0 else math.nan,
         float(np.std(usual)) if usual.size else math.nan,
         float(max(usual.max() - typical, typical - usual.min())) if usual.size else 0.0,
-        tuple(sorted({gap for _, s in _one_each(columns) for gap in gaps(s)})),
+        tuple(sorted({gap for s in columns.values() for gap in gaps(s)})),
         track.notes,
     )
 

@@ -1,6 +1,6 @@
 """Rows of uniform grids, and the stretches of time in which every topic is present."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -23,14 +23,16 @@ class Gap(NamedTuple):
     end: float
 
 
-class Segment(NamedTuple):
-    """Rows that follow each other."""
+class Stretch(NamedTuple):
+    """Rows that become one file, or are dropped."""
 
     start: float
-    """Time of the first row [s]."""
+    """Time of the first row on the clock of the log [s]."""
     rows: int
+    missing: Mapping[str, int] = {}
+    """Empty fields of readings."""
     why: str = ""
-    """Reason why it is dropped; empty: it is used."""
+    """Reason why it is dropped."""
 
 
 def reach(signal: Signal, dt: float) -> float:
@@ -51,9 +53,8 @@ def sent_on_change(signal: Signal, dt: float) -> bool:
     They are a few, set points, or irregular; or they go on after each silence as if there had been none.
     """
     steps = np.diff(signal.t)
-    fewest_intervals = 10  # intervals between commands from which on they may have a rate
-    # Median interval from which on commands are set points [s], if it is more than a row: no drive waits so long
-    if steps.size < fewest_intervals or signal.interval >= max(0.5, 1.5 * dt):
+    # A few; or set points, that is with a median interval of more than a row: no drive waits so long
+    if steps.size < 10 or signal.interval >= max(0.5, 1.5 * dt):
         return True
     usual = np.mean((steps >= 0.5 * signal.interval) & (steps <= 1.5 * signal.interval))
     alike = np.mean((steps[1:] >= steps[:-1] / 1.5) & (steps[1:] <= 1.5 * steps[:-1]))  # of a stream whose rate changes
@@ -62,15 +63,12 @@ def sent_on_change(signal: Signal, dt: float) -> bool:
     if max(usual, alike) < 0.45:
         return True
     silent = steps > longest_silence(signal, dt, None)
-    if not silent.any():
-        return False
     jumps = np.abs(np.diff(signal.y))
     step = float(np.median(jumps[~silent]))
-    if step == 0 or jumps[silent].max() > 2 * step:  # sent without change, too; or not where it was
+    if not silent.any() or step == 0 or jumps[silent].max() > 2 * step:  # sent without change too, or not where it was
         return False
+    # Chance at which a smooth command comes back after every silence to within two steps of its value
     near = 4 * step / float(np.ptp(np.quantile(signal.y, (0.05, 0.95))))
-    # Chance at which a smooth command comes back after every silence to within two steps of its value, below which it
-    # stood still in them
     return near ** int(np.count_nonzero(silent)) < 0.01
 
 
@@ -103,7 +101,7 @@ def covered(parts: Sequence[Spans], least: int) -> Spans:
     return np.stack([edges[order][first], edges[order][last]], axis=1)
 
 
-def runs(spans: Spans, fastest: Signal, dt: float) -> list[Segment]:
+def runs(spans: Spans, fastest: Signal, dt: float) -> list[Stretch]:
     """Rows `dt` apart in each span, from a reading of the fastest topic on if there is one near.
 
     Readings as regular as the rows are taken as they are.  Spans less than a row apart are one.
@@ -113,14 +111,14 @@ def runs(spans: Spans, fastest: Signal, dt: float) -> list[Segment]:
     reading = np.append(fastest.t, np.inf)[np.searchsorted(fastest.t, start - SAME_TIME * dt)]
     start = np.where(reading < start + max(fastest.interval, dt), reading, start)
     rows = np.floor((end - start) / dt + SAME_TIME).astype(int) + 1
-    return [Segment(first, n) for first, n in zip(start.tolist(), rows.tolist(), strict=True) if n > 0]
+    return [Stretch(first, n) for first, n in zip(start.tolist(), rows.tolist(), strict=True) if n > 0]
 
 
-def cut(runs: Sequence[Segment], dt: float, shortest: int, longest: int) -> list[Segment]:
+def cut(runs: Sequence[Stretch], dt: float, shortest: int, longest: int) -> list[Stretch]:
     """The runs of rows, the long ones in equal parts, the short ones marked as dropped."""
-    segments = []
+    out = []
     for run in runs:
         places = np.round(np.linspace(0, run.rows, -(-run.rows // longest) + 1)).astype(int).tolist()
         why = "" if run.rows >= shortest else f"shorter than {shortest} rows"
-        segments += [Segment(run.start + a * dt, b - a, why) for a, b in pairwise(places)]
-    return segments
+        out += [Stretch(run.start + a * dt, b - a, why=why) for a, b in pairwise(places)]
+    return out

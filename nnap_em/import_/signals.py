@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 SAME_TIME = 1e-3
 """Share of a row by which times may differ and still be one: clocks count in ns, and rows are rounded."""
@@ -51,10 +51,8 @@ def averaged(signal: Signal, at: Float[np.ndarray, " row"], dt: float) -> Float[
     return (integral(at + dt) - integral(at)) / dt
 
 
-def interpolated(
-    signal: Signal, at: Float[np.ndarray, " row"], dt: float, reach: float
-) -> tuple[Float[np.ndarray, " row"], Bool[np.ndarray, " row"]]:
-    """Straight lines between neighbours, and where there is a value.
+def interpolated(signal: Signal, at: Float[np.ndarray, " row"], dt: float, reach: float) -> Float[np.ndarray, " row"]:
+    """Straight lines between neighbours; NaN where there is no value.
 
     There is none where neighbours are more than `reach` [s] apart or a jump lies between them, nor, where readings come
     slower than rows, in rows that are nearest to no reading.  Between readings of noise sigma a value has less: from
@@ -72,7 +70,7 @@ def interpolated(
     share = (x - t[right - 1]) / width
     share = np.where(across, np.round(share), share)
     y = signal.y[right - 1] * (1 - share) + signal.y[right] * share
-    return np.where(known, y, np.nan), known
+    return np.where(known, y, np.nan)
 
 
 def _before(signal: Signal, at: Float[np.ndarray, " x"]) -> np.ndarray:

@@ -102,5 +102,5 @@ def columns_table(path: Path, columns: Mapping[str, Address]) -> dict[str, Float
         y = track.values[place.path]
         t, y = (track.t - origin)[np.isfinite(y)] * 1e-9, y[np.isfinite(y)]
         signal = Signal(place.topic, t, (place.scale or 1.0) * y)
-        table[name] = interpolated(signal, at, dt, reach(signal, dt))[0] if y.size > 1 else np.full(at.size, math.nan)
+        table[name] = interpolated(signal, at, dt, reach(signal, dt)) if y.size > 1 else np.full(at.size, math.nan)
     return table

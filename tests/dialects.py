@@ -76,10 +76,10 @@ def workbook(path: Path, columns: dict[str, np.ndarray]) -> Path:
     return path
 
 
-def codesys(path: Path, flags: int = 16) -> Path:
-    """CODESYS trace (`*.trace.csv`): a block for each variable."""
+def codesys(path: Path, flags: int = 16, comment: bool = False) -> Path:
+    """CODESYS trace (`*.trace.csv`): a block for each variable, maybe with keys without a value."""
     unit = 1e6 if flags & 32 else 1e3
-    lines = ["[key]; [value]", "Version; 0x03050000", "Name; Application.Trace", f"Flags; {flags}"]
+    lines = ["[key]; [value]", "Version; 0x03050000", *["Comment", ";", ""] * comment, f"Flags; {flags}"]
     for i, (name, y) in enumerate({"PLC_PRG.theta1": Q, "PLC_PRG.dtheta1": V, "PLC_PRG.u": U}.items()):
         lines += [f"{i}.Variable; {name}", f"{i}.Color; 4278190335", f"{i}.Data; "]
         lines += [f"; {round(unit * t)}; {_number(x)}" for t, x in zip(T, y, strict=True)]

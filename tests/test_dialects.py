@@ -23,10 +23,10 @@ from nnap_em.data.dataset import DataError
 from nnap_em.data.logs import DataWarning, read_logs
 from nnap_em.data.rig import RigError, read_rig
 from nnap_em.import_ import table_file, text_file
-from nnap_em.import_.columns import resolve
+from nnap_em.import_.columns import in_unit, resolve
 from nnap_em.import_.declared import read_plan
 from nnap_em.import_.files import reader
-from nnap_em.import_.recording import Address, Topic, address, last_word, word_of
+from nnap_em.import_.recording import Address, Topic, address, last_word, places
 from nnap_em.import_.resample import resample
 from nnap_em.init.from_machine import draft_machine
 from nnap_em.systems import specs
@@ -94,6 +94,7 @@ READ = {  # what writes a file, its name, and the addresses that names do not gi
     "TwinCAT Scope, names only": (PLAIN, "a.csv", BARE),
     "CODESYS trace": (dialects.codesys, "a.trace.csv", {}),
     "CODESYS trace in us": (functools.partial(dialects.codesys, flags=36), "a.trace.csv", {}),
+    "CODESYS trace with lines of its own": (functools.partial(dialects.codesys, comment=True), "a.trace.csv", {}),
     "CODESYS text": (dialects.codesys_text, "a.txt", {}),
     "LabVIEW": (dialects.labview, "a.lvm", {}),
     "LabVIEW, many times": (functools.partial(dialects.labview, x_columns="Multi"), "a.lvm", {}),
@@ -152,6 +153,7 @@ NAMED = {  # the column and its name in the log, mapped as it stands; how many S
     "degrees a second": ("dtheta1", "Rate [deg/s]", DEG), "mN m": ("u", "Torque [mN·m]", 1e-3),
     "kN m": ("u", "M [kNm]", 1e3), "N m": ("u", "Torque [Nm]", 1.0), "no unit": ("u", "Torque", 1.0),
     "a letter": ("theta1", "angle_s", 1.0), "a joint": ("theta1", "position[m]", 1.0),
+    "not known": ("theta1", "Angle [counts]", 1.0),
     "amperes": ("u", "Current [A]", "in A by its name, but N m is read; write [import.columns] u = { from = "
                 "\"Current [A]\", scale = ... } with N m per A, or [input] kind = \"affine\""),
     "milliamperes": ("u", "current_mA", "in mA by its name, but N m is read"),
@@ -164,18 +166,15 @@ NAMED = {  # the column and its name in the log, mapped as it stands; how many S
 @pytest.mark.parametrize("column, name, size", NAMED.values(), ids=NAMED)
 def test_a_unit_in_the_name_of_a_mapped_column_scales_it_or_is_refused(tmp_path, column, name, size):
     """A scale in the mapping counts instead of the unit in the name."""
-    names = {"theta1": "theta1", "dtheta1": "dtheta1", "u": "u"} | {column: name}
-    log = dialects.table(tmp_path / "a.csv", ",".join(["time", names["u"], names["theta1"], names["dtheta1"]]), COLUMNS)
-    place = ["u", "theta1", "dtheta1"].index(column)
+    rig, at = read_rig(_rig(tmp_path), specs), Address("", name)
     if isinstance(size, str):
-        with pytest.raises(DataError) as refused:
-            _imported(log, _rig(tmp_path, {column: f'"{name}"'}))
-        assert size in str(refused.value) and str(log) in str(refused.value)
+        with pytest.raises(DataError, match=re.escape(size)):
+            in_unit(tmp_path, column, at, rig)
     else:
-        (table,) = _imported(log, _rig(tmp_path, {column: f'"{name}"'}))
-        np.testing.assert_allclose(table[:, place], size * COLUMNS[1 + place], rtol=1e-8, atol=1e-8 * size)
-    (table,) = _imported(log, _rig(tmp_path, {column: f'{{ from = "{name}", scale = 3 }}'}))
-    np.testing.assert_allclose(table[:, place], 3 * COLUMNS[1 + place], rtol=1e-8, atol=3e-8)
+        scaled, note = in_unit(tmp_path, column, at, rig)
+        assert scaled.scale == pytest.approx(size, rel=1e-12)
+        assert bool(note) == (size != 1 or "counts" in name) and ("counts" in note) == ("counts" in name)
+    assert in_unit(tmp_path, column, at._replace(scale=3.0), rig) == (Address("", name, 3.0), "")
 
 
 @pytest.mark.parametrize("suffix", ["mat", "parquet", "h5", "mcap", "xlsx"])
@@ -213,14 +212,6 @@ def test_a_unit_of_the_file_alone_counts(tmp_path):
         _close([table], len(table), 1e-7)
 
 
-def test_a_unit_that_is_not_known_is_named(tmp_path):
-    log = dialects.table(tmp_path / "a.csv", "time,u,Angle [counts],dtheta1", COLUMNS)
-    rig_file = _rig(tmp_path, {"theta1": '"Angle [counts]"'})
-    rig = read_rig(rig_file, specs)
-    notes = resample(log, rig, read_plan(rig_file, (*rig.logged_inputs, *rig.measured)), {}).notes
-    assert "theta1 from 'Angle [counts]': taken in rad, since the unit 'counts' is not known" in notes
-
-
 def test_a_column_of_a_data_set_is_in_the_unit_of_its_name(tmp_path):
     path = tmp_path / "rig.toml"
     path.write_text(RIG.replace('["u"]', '["M [mNm]"]'))
@@ -243,8 +234,10 @@ MOMENTS = {  # the header, and the texts of a time [s] on 3 November 2026, from 
 }
 
 
-@pytest.mark.parametrize("header, text", MOMENTS.values(), ids=MOMENTS)
-@pytest.mark.parametrize("separator, decimal", [(",", "."), (";", ",")])
+MOMENTS = {name: (*moment, *marks) for (name, moment), marks in zip(MOMENTS.items(), 5 * (",.", ";,"), strict=False)}
+
+
+@pytest.mark.parametrize("header, text, separator, decimal", MOMENTS.values(), ids=MOMENTS)
 def test_runs_of_one_file_with_times_of_day_are_sequences(tmp_path, header, text, separator, decimal):
     """Three runs of 4 s with silences of 20 s, over midnight."""
     start = datetime(2026, 11, 3, 23, 59, 40, tzinfo=UTC)
@@ -332,7 +325,8 @@ WORDS = {  # a path, and its last word
 def test_the_last_word_of_a_path():
     for path, word in WORDS.items():
         assert last_word(path) == word
-        assert word_of(f"{path} [deg]" if "[" not in path else path)[1] == (DEG if "[" not in path else 1.0)
+        ((at, _),) = places([Topic("", "", None, (path if "[" in path else f"{path} [deg]",))])
+        assert at.scale == (None if "[" in path else pytest.approx(DEG))
 
 
 def test_a_name_with_a_colon_is_no_topic(tmp_path):
@@ -360,21 +354,16 @@ def test_a_log_without_times_is_read_where_dt_is_declared(tmp_path, suffix):
         read_logs(path.parent, rig)
 
 
-def test_structs_with_different_clocks_are_refused(tmp_path):
-    def struct(t, y):
-        return {"time": t, "signals": {"values": y, "label": "", "dimensions": 1}}
-
-    path, said = tmp_path / "a.mat", "column 'time': stands there twice with different numbers; save signals of one"
-    scipy.io.savemat(path, {"u": struct(T, U), "theta1": struct(T[::2], Q[::2]), "dtheta1": struct(T, V)})
-    with pytest.raises(DataError, match=said):
+def test_structs_with_different_clocks_are_refused_and_columns_of_a_matrix_have_numbers(tmp_path):
+    """Simulink's structures with time, and its format Array."""
+    path = tmp_path / "a.mat"
+    struct = lambda t, y: {"time": t, "signals": {"values": y, "label": ""}}  # noqa: E731
+    scipy.io.savemat(path, {"u": struct(T, U), "theta1": struct(T[1:], Q[1:])})
+    with pytest.raises(DataError, match="column 'time': stands there twice with different numbers; save signals of"):
         reader(path).topics(path)
-
-
-def test_columns_of_a_matrix_have_numbers(tmp_path):
-    """Simulink's format Array."""
     for name in ("out", "yout"):
-        scipy.io.savemat(tmp_path / "a.mat", {"tout": T[:, None], name: np.stack([Q, V], 1)})
-        (topic,) = reader(tmp_path / "a.mat").topics(tmp_path / "a.mat")
+        scipy.io.savemat(path, {"tout": T[:, None], name: np.stack([Q, V], 1)})
+        (topic,) = reader(path).topics(path)
         assert topic.fields == (f"{name}[0]", f"{name}[1]") and "'tout'" in topic.kind
 
 
@@ -383,13 +372,6 @@ def test_a_plain_csv_file_is_none_of_another_dialect(tmp_path):
         assert not text_file.foreign(dialects.table(tmp_path / "a.csv", header, (T, U, Q)))
     for header in ('time,"a, b",c', "time,a,a", "# time,a,b"):
         assert text_file.foreign(dialects.table(tmp_path / "a.csv", header, (T, U, Q)))
-
-
-def test_a_codesys_trace_with_a_line_of_its_own_is_read(tmp_path):
-    log = dialects.codesys(tmp_path / "a.trace.csv")
-    log.write_text(log.read_text().replace("Flags; 16", "Flags\nComment\n;\n\nFlags;"))
-    (table,) = _imported(log, _rig(tmp_path))
-    _close([table], len(table), 2e-8)
 
 
 @pytest.mark.parametrize("rows", [0, 1])

@@ -17,7 +17,7 @@ from nnap_em.em.build import build_system
 from nnap_em.fit.check import late
 from nnap_em.fit.inverse_dynamics import Lag, lag, regression
 from nnap_em.model import hooks
-from nnap_em.model.state_space import Inputs, with_effects
+from nnap_em.model.state_space import with_effects
 from nnap_em.systems import specs
 
 DT, ROWS = 0.05, 40
@@ -77,34 +77,34 @@ def test_padding_and_horizons_end_the_course():
     np.testing.assert_array_equal(short[:18], whole[:18])
 
 
-def test_a_lag_is_that_of_the_line_between_rows():
+def _lagged(u, number):
     """tau y' = u - y, at rest with the input before the first row."""
-    lag, u = catalogue["actuator_lag"].of(0.13, joint=1), _signal()
-    _, y, _ = lsim(([[-1 / 0.13]], [[1 / 0.13]], [[1.0]], [[0.0]]), u, DT * np.arange(ROWS), X0=[u[0]], interp=True)
-    np.testing.assert_allclose(jax.jit(lambda u: LINES.through(lag, u))(u), y, atol=1e-12)
+    return lsim(([[-1 / number]], [[1 / number]], [[1.0]], [[0.0]]), u, DT * np.arange(ROWS), X0=[u[0]], interp=True)[1]
 
 
-def test_a_delay_moves_the_line():
-    u, t, delays = _signal(), DT * np.arange(ROWS), (0.0, 0.02, 0.05, 0.12)
-    laws = [catalogue["input_delay"].of(delay, joint=1) for delay in delays]
-    moved = jax.jit(lambda u: [LINES.through(late, u) for late in laws])(u)
-    np.testing.assert_allclose(moved, [np.interp(t - delay, t, u) for delay in delays], atol=1e-12)
+def _moved(u, number):
+    """The line between rows, later."""
+    return np.interp(DT * np.arange(ROWS) - number, DT * np.arange(ROWS), u)
 
 
-@pytest.mark.parametrize("name, number", [("actuator_lag", 0.13), ("input_delay", 0.12), ("motor_gain", 0.1)])
-def test_row_by_row_is_the_whole(name, number):
-    effect, u = catalogue[name].of(number, joint=1), _signal()
-    system = _model().system
+@pytest.mark.parametrize(
+    "name, number, truth",
+    [("actuator_lag", 0.13, _lagged), ("input_delay", 0.02, _moved), ("input_delay", 0.12, _moved),
+     ("motor_gain", 0.1, lambda u, number: (1 + number) * u)],
+)  # fmt: skip
+def test_what_a_drive_does_to_the_line_between_rows_at_once_and_row_by_row(name, number, truth):
+    effect, u, system = catalogue[name].of(number, joint=1), _signal(), _model().system
     stream = hooks.command_stream((effect,), None, system, LINES)
     step = lambda memory, row: stream.step(memory, row[0], row[1])  # noqa: E731
     first = jnp.arange(ROWS) == 0
-    found, whole = jax.jit(
+    rows, whole = jax.jit(
         lambda u: (
             jax.lax.scan(step, stream.memory, (u, first))[1],
             hooks.reaching((effect,), system, u, LINES),
         )
     )(jnp.asarray(u)[:, None])
-    np.testing.assert_allclose(found, whole, atol=1e-12)
+    np.testing.assert_allclose(rows[:, 0], truth(u, number), atol=1e-12)
+    np.testing.assert_allclose(whole[:, 0], truth(u, number), atol=1e-12)
 
 
 def test_a_late_sensor_reads_the_line_before_its_row():
@@ -116,13 +116,6 @@ def test_a_late_sensor_reads_the_line_before_its_row():
     slope = np.diff(u) / DT
     past = x[1:, 0] - delay * x[1:, 1] + (u[1:] * delay**2 / 2 - slope * delay**3 / 6) / m  # by a line
     np.testing.assert_allclose(read, past, atol=1e-12)
-
-
-def test_held_inputs_have_no_course():
-    inputs = _model(smooth=False).inputs(_log(_signal()))
-    assert inputs.course is None and inputs.at(0.5) is inputs
-    line = Inputs(jnp.ones(1), jnp.zeros(1), jnp.zeros(()), jnp.zeros(()), None, jnp.asarray([[0.5], [0.8]]))
-    np.testing.assert_allclose(line.at(0.5).u, [1.25 - 0.1])
 
 
 def _rig(tmp_path, hold):

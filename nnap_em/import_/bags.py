@@ -14,10 +14,10 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ..data.dataset import DataError
-from ..data.formats import unreadable
+from ..data.formats import refuse, unreadable
 from .clock import choose
 from .objects import flatten, pick
-from .recording import EXTRA, OTHER, Recording, Topic, refuse
+from .recording import EXTRA, OTHER, Recording, Topic
 
 SAMPLES = 20
 """Messages of a channel that are looked at for its fields: not every message needs to have them all."""

@@ -7,9 +7,10 @@ import numpy as np
 from jaxtyping import Float, Int, Real
 
 from ..data.dataset import Array
+from ..data.formats import refuse
 from ..data.units import UNITS
 from ..numerics.digits import counted
-from .recording import SECOND, Lag, Recording, Track, refuse
+from .recording import SECOND, Lag, Recording, Track
 
 BACK = 1.0
 """Seconds that a log may be out of order: writers of several threads are, a clock that was set back is more."""

@@ -1,14 +1,17 @@
 """Addresses of the columns of a rig in a log: as declared, or by their names, in the unit that these end in."""
 
+import difflib
 import math
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from ..data.dataset import DataError
+from ..data.formats import refuse
 from ..data.rig import Rig
 from ..data.units import UNITS, factor, named_unit
-from .recording import Address, Topic, field_of, near, places, refuse
+from ..numerics.digits import counted
+from .recording import OTHER, Address, Topic, places
 
 
 def resolve(
@@ -25,8 +28,8 @@ def resolve(
 
 
 def declared_at(path: Path, topics: Sequence[Topic], address: Address, column: str) -> Address:
-    """The address as the file has it, whose names may hold a colon, and end in a unit that is not declared."""
-    where = f"column {column!r} from {str(address)!r}"
+    """The address as the file has it: names may hold a colon, end in a unit, and count an entry that has a name."""
+    where, at = f"column {column!r} from {str(address)!r}", address.path
     for topic in topics:
         there = str(address).removeprefix(f"{topic.name}:" if topic.name else "")
         alike = [field for field in topic.fields if there in (field, named_unit(field, brackets=True)[0])]
@@ -36,7 +39,17 @@ def declared_at(path: Path, topics: Sequence[Topic], address: Address, column: s
     if topic is None:
         hint = near(address.topic, [topic.name for topic in topics])
         raise DataError(f"{path}: {where}: there is no topic {address.topic!r}; {hint}")
-    return address._replace(path=field_of(path, topic, address.path, where))
+    if not topic.fields:
+        refuse(path, where, f"topic {topic.name!r} ({topic.kind}) holds no numbers that can be read", OTHER)
+    match = re.fullmatch(r"(.*)\[(\d+)\]", at)
+    row = [name for name in topic.fields if match and re.fullmatch(re.escape(match[1]) + r"\[[^\]]*\]", name)]
+    if match and int(match[2]) < len(row):
+        return address._replace(path=row[int(match[2])])
+    if match and row:
+        problem = f"{match[1]!r} of {topic.name!r} has {counted(len(row), 'value')}"
+        refuse(path, where, problem, f"count from 0 to {len(row) - 1}")
+    owner = f"topic {topic.name!r}" if topic.name else "the table"
+    refuse(path, where, f"{owner} has no field {at!r}", near(at, topic.fields))
 
 
 def in_unit(path: Path, column: str, at: Address, rig: Rig) -> tuple[Address, str]:
@@ -70,7 +83,9 @@ def _by_name(path: Path, topics: Sequence[Topic], column: str, is_input: bool) -
     ]
     hint = f'write [import.columns] {column} = "topic:field" in rig.toml'
     if not addresses:
-        raise DataError(f"{path}: column {column!r}: nothing is called so; {hint}; {_nearest(column, every)}")
+        shown = [str(at) for at in every]
+        words = [re.split(r"[:.\[]", name.rstrip("]"))[-1] for name in shown]
+        raise DataError(f"{path}: column {column!r}: nothing is called so; {hint}; {near(column, shown, words)}")
     if len(addresses) > 1:
         several = " and ".join(repr(str(each)) for each in addresses[:4])
         raise DataError(f"{path}: column {column!r}: may be {several}; {hint}")
@@ -85,12 +100,10 @@ def _names(column: str, is_input: bool) -> list[str]:
     return [column, *(f"{array}[{column.removeprefix(d)}]" for d, array in parts if column.startswith(d))]
 
 
-def _nearest(column: str, addresses: Sequence[Address]) -> str:
-    """The hint by the last word of each address, which is what a column is called by."""
-    every = [str(at) for at in addresses]
-    words = {re.split(r"[:.\[]", name.rstrip("]"))[-1]: name for name in every}
-    text = near(column, list(words))
-    match = re.match(r"did you mean '([^']*)'\? ", text)
-    hint = f"did you mean {words[match[1]]!r}? " if match else ""
-    names = ", ".join(every[:12]) + (f", and {len(every) - 12} more" if len(every) > 12 else "")
-    return f"{hint}there are: {names or 'no numbers at all'}"
+def near(word: str, names: Sequence[str], words: Sequence[str] = ()) -> str:
+    """The hint for a misspelt name among many, which are called by `words`."""
+    called = {call.casefold(): name for call, name in zip(words or names, names, strict=True)}
+    close = difflib.get_close_matches(word.casefold(), called, 1)
+    question = f"did you mean {called[close[0]]!r}? " if close else ""
+    more = f", and {len(names) - 12} more" if len(names) > 12 else ""
+    return f"{question}possible here: {', '.join(names[:12]) or 'none'}{more}"

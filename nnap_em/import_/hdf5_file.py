@@ -10,11 +10,11 @@ from jaxtyping import Float, Int
 
 from ..data.dataset import DataError
 from ..data.dates import dated
-from ..data.formats import unreadable
+from ..data.formats import refuse, unreadable
 from ..data.units import UNITS, is_time, named_unit
 from .clock import nanoseconds, rising
 from .objects import LISTED_ENTRIES
-from .recording import EXTRA, Recording, Topic, Track, refuse
+from .recording import EXTRA, Recording, Topic, Track
 
 
 def topics(path: Path) -> tuple[Topic, ...]:

@@ -2,17 +2,15 @@
 
 import functools
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..data.formats import refuse
-from ..data.rig import nearest, toml_text
+from ..data.rig import toml_text
 from ..data.units import named_unit, si
-from ..numerics.digits import counted
 
 EXTRA = 'pip install "nnap-em[logs]"'
 SECOND = 1_000_000_000
@@ -121,29 +119,4 @@ def steps(path: str) -> tuple[str | int, ...]:
     return tuple(name or (int(index) if index.isdigit() else f"[{index}") for name, index in found)
 
 
-def field_of(file: Path, topic: Topic, path: str, where: str) -> str:
-    """The path as the topic lists it, which names a joint where an index stands; DataError where there is none."""
-    if path in topic.fields:
-        return path
-    match = re.fullmatch(r"(.*)\[(\d+)\]", path)
-    row = [name for name in topic.fields if match and re.fullmatch(re.escape(match[1]) + r"\[[^\]]*\]", name)]
-    if match and row:
-        if int(match[2]) < len(row):
-            return row[int(match[2])]
-        problem = f"{match[1]!r} of {topic.name!r} has {counted(len(row), 'value')}"
-        refuse(file, where, problem, f"count from 0 to {len(row) - 1}")
-    if not topic.fields:
-        refuse(file, where, f"topic {topic.name!r} ({topic.kind}) holds no numbers that can be read", OTHER)
-    owner = f"topic {topic.name!r}" if topic.name else "the table"
-    refuse(file, where, f"{owner} has no field {path!r}", near(path, topic.fields))
-
-
 OTHER = "write it as ROS 2 CDR, JSON or protobuf, or name another topic"
-
-
-def near(word: str, known: Sequence[str], most: int = 12) -> str:
-    """The hint for a misspelt name among many."""
-    text = nearest(word, known)
-    first, mark, tail = text.partition("possible here: ")
-    names = tail.split(", ")
-    return first + mark + ", ".join(names[:most]) + (f", and {len(names) - most} more" if len(names) > most else "")

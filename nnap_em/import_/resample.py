@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..data.dataset import DataError
+from ..data.formats import refuse
 from ..data.rig import SMOOTH, Rig, nearest
 from ..data.units import other_unit
 from ..numerics.digits import counted
@@ -18,7 +19,7 @@ from .columns import in_unit, resolve
 from .declared import LONGEST, Plan
 from .files import read, reader
 from .readings import as_taken
-from .recording import UNTIMED, Address, Recording, Topic, Track, refuse
+from .recording import UNTIMED, Address, Recording, Topic, Track
 from .segments import (
     FEWEST_ROWS,
     Gap,

@@ -19,6 +19,7 @@ from ..data.formats import (
     columns_of,
     csv_table,
     header_hint,
+    refuse,
     split,
     table_of,
     text_lines,
@@ -27,7 +28,7 @@ from ..data.formats import (
 )
 from ..data.units import clock_of, is_episode, named_unit
 from .clock import in_a_row, nanoseconds, rising
-from .recording import EXTRA, SECOND, UNTIMED, Recording, Topic, Track, refuse
+from .recording import EXTRA, SECOND, UNTIMED, Recording, Topic, Track
 from .text_file import CODESYS, layout, plain
 
 SHEETS = (".xlsx", ".xls", ".ods")

@@ -2,7 +2,6 @@
 
 import struct
 import zipfile
-from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
@@ -184,10 +183,3 @@ def table(path: Path, header: str, columns, separator: str = ",", decimal: str =
     mark = '"' if quote else ""
     rows = [separator.join(f"{mark}{_number(x, decimal)}{mark}" for x in row) for row in zip(*columns, strict=True)]
     return _write(path, [*above, *header.split("\n"), *rows, *([last] if last else [])], encoding)
-
-
-def dated(path: Path, names: str, columns) -> Path:
-    """A text table with decimal commas whose times are dates of ISO 8601."""
-    days = [datetime.fromtimestamp(1.7e9 + t, UTC).isoformat() for t in columns[0]]
-    rows = [";".join([day, *(_number(x, ",") for x in row)]) for day, *row in zip(days, *columns[1:], strict=True)]
-    return _write(path, [names, *rows])

@@ -61,13 +61,16 @@ READABLE = {
     "blanks around fields": lambda s: s.replace(",", " , "),
     "names in quotes": lambda s: s.replace("theta1,dtheta1", '"theta1","dtheta1"'),
     "another column": lambda s: s.replace("\n", ",note\n"),
+    "UTF-16": lambda s: s.encode("utf-16"),
+    "western European": lambda s: s.replace("\n", ",\n").replace(",\n", ",Wert °\n", 1).encode("cp1252"),
     "other order": lambda s: "\n".join(",".join(reversed(row.split(","))) for row in s.splitlines()),
 }
 
 
 @pytest.mark.parametrize("change", READABLE.values(), ids=READABLE.keys())
 def test_harmless_differences_are_read_alike(tmp_path, change):
-    (tmp_path / "01.csv").write_bytes(change(csv_text(swing())).encode("utf-8"))
+    content = change(csv_text(swing()))
+    (tmp_path / "01.csv").write_bytes(content if isinstance(content, bytes) else content.encode("utf-8"))
     logs = read_logs(tmp_path, swing_rig())
     columns = swing()
     assert (logs.files, logs.columns) == (("01.csv",), ("u", "theta1", "dtheta1"))

@@ -86,7 +86,6 @@ HEADER = "Zeit;u;theta1;dtheta1\nms;Nm;°;rad/s"
 UNITS = _table(HEADER, (1e3 * T, *DEGREES[1:]), ";", ",", above=ABOVE, encoding="cp1252")
 QUOTED = _table('"time [s]","Motor torque, Nm","theta1 [deg]","dtheta1 [rad/s]"', DEGREES)
 PATHS = _table(f"__time,{JOINT}/effort,{JOINT}/position,{JOINT}/velocity", (1.7e9 + T, *COLUMNS[1:]))
-DATES = functools.partial(dialects.dated, names=_names(";"), columns=COLUMNS)
 PLAIN = functools.partial(dialects.twincat, full=False, separator=",", decimal=".")
 READ = {  # what writes a file, its name, and the addresses that names do not give
     "TwinCAT Scope": (dialects.twincat, "a.csv", SCOPE),
@@ -110,7 +109,6 @@ READ = {  # what writes a file, its name, and the addresses that names do not gi
     "colons": (_table("time,a:u,a:pos,a:vel"), "a.csv", {"theta1": '"a:pos"', "dtheta1": '"a:vel"'}),
     "PlotJuggler": (PATHS, "a.csv", QUANTITIES),
     "NumPy": (_table("# time u theta1 dtheta1", COLUMNS, " "), "a.txt", {}),
-    "dates": (DATES, "a.csv", {}),
     "no time": (_table("u,theta1,dtheta1", COLUMNS[1:]), "a.csv", {}),
     "no time, decimal comma": (_table("u;theta1;dtheta1", COLUMNS[1:], ";", ","), "a.csv", {}),
 }
@@ -401,12 +399,13 @@ _lines = st.lists(st.lists(st.text('0159.,;-eE\t"#NameTrueX_Value[]°', max_size
 @example(rows=[["Channels"], ["Delta_X"], ["X_Value", "a"], ["", "4"], ["", "4"]], separator="\t")
 @given(rows=_lines, separator=st.sampled_from(",;\t "))
 def test_any_text_is_read_or_refused(tmp_path_factory, rows, separator):
-    path = tmp_path_factory.getbasetemp() / "any.txt"
-    path.write_text("\n".join(separator.join(row) for row in rows))
-    try:
-        text_file.foreign(path)
-        wanted = {topic.name: topic.fields for topic in table_file.topics(path)}
-        for track in table_file.read(path, wanted).tracks.values():
-            assert (np.diff(track.t) > 0).all()
-    except DataError as refused:
-        assert str(path) in str(refused) and ";" in str(refused)
+    for suffix in ("txt", "csv"):
+        path = tmp_path_factory.getbasetemp() / f"any.{suffix}"
+        path.write_text("\n".join(separator.join(row) for row in rows))
+        try:
+            text_file.foreign(path)
+            wanted = {topic.name: topic.fields for topic in table_file.topics(path)}
+            for track in table_file.read(path, wanted).tracks.values():
+                assert (np.diff(track.t) > 0).all()
+        except DataError as refused:
+            assert str(path) in str(refused) and ";" in str(refused)

@@ -248,7 +248,7 @@ REFUSED = {  # what is wrong with the rig's table, with the log or the words of 
     "no scale": (_said('"/cmd:data[0]"', '{ from = "/cmd:data[0]", scale = 0 }'), {}, ["scale is 0"]),
     "input": ({"more": 'input = "holds"'}, {}, ["[import] input", "did you mean 'hold'"]),
     "gap": ({"more": "gap = -1"}, {}, ["[import] gap", "seconds above 0"]),
-    "no overlap": ({}, {"command_t": T + 100}, ["topics '/js' and '/cmd'", "no time in common", "--shift /cmd="]),
+    "no overlap": ({}, {"command_t": T + 100}, ["columns 'theta1' and 'u'", "no time in common", "--shift /cmd="]),
     "all NaN": (
         {},
         {"command": np.full_like(T, np.nan)},

@@ -169,19 +169,14 @@ def _gridded(path: Path, rig: Rig, plan: Plan, signals: Mapping[str, Signal]) ->
 
 
 def _common(path: Path, signals: Mapping[str, Signal], spans: Mapping[str, Spans]) -> Spans:
-    """Interval in which all topics are present [s]; DataError where there is none."""
-    topics: dict[str, tuple[float, float]] = {}
-    for name, each in spans.items():
-        first, last = topics.get(signals[name].topic, (-math.inf, math.inf))
-        topics[signals[name].topic] = (max(first, each[0, 0]), min(last, each[-1, 1]))
-    start, end = max(first for first, _ in topics.values()), min(last for _, last in topics.values())
-    if end <= start:
-        late = max(topics, key=lambda topic: topics[topic][0])
-        early = min(topics, key=lambda topic: topics[topic][1])
-        ranges = ", ".join(f"{topic!r} from {first:.6g} to {last:.6g} s" for topic, (first, last) in topics.items())
-        hint = f"--shift {late}=SECONDS where their clocks differ, or record them together"
-        refuse(path, f"topics {early!r} and {late!r}", f"have no time in common ({ranges})", hint)
-    return np.array([[start, end]])
+    """Interval in which all columns are present [s]; DataError where there is none."""
+    ends = {name: (float(each[0, 0]), float(each[-1, 1])) for name, each in spans.items()}
+    late, early = max(ends, key=lambda name: ends[name][0]), min(ends, key=lambda name: ends[name][1])
+    if ends[early][1] <= ends[late][0]:
+        ranges = ", ".join(f"{name!r} from {first:.6g} to {last:.6g} s" for name, (first, last) in ends.items())
+        hint = f"--shift {signals[late].topic}=SECONDS where their clocks differ, or record them together"
+        refuse(path, f"columns {early!r} and {late!r}", f"have no time in common ({ranges})", hint)
+    return np.array([[ends[late][0], ends[early][1]]])
 
 
 def _sparse(path: Path, seen: Spans, fastest: Signal, dt: float) -> None:

@@ -12,6 +12,7 @@ import plant
 
 from nnap_em.commands import cli
 from nnap_em.data.dataset import Dataset
+from nnap_em.data.formats import columns_of, table_of
 from nnap_em.data.rig import Rig, read_rig, write_rig
 from nnap_em.diagnosis.residual import Residual
 from nnap_em.effects.base import SearchScales
@@ -80,6 +81,11 @@ def csv_text(columns: dict[str, np.ndarray]) -> str:
     """A log as the text of its file."""
     rows = [",".join(f"{x:.9g}" for x in row) for row in zip(*columns.values(), strict=True)]
     return "\n".join([",".join(columns), *rows]) + "\n"
+
+
+def read_table(path: Path, required: Sequence[str], gaps: Sequence[str] = ()) -> np.ndarray:
+    """Columns of a log as those of a sequence are read."""
+    return columns_of(table_of(path), required, gaps)
 
 
 def with_field(line: int, column: str, text: str) -> Callable[[str], str]:

@@ -7,14 +7,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import csv_text, rig_text, swing, with_field
+from helpers import csv_text, read_table, rig_text, swing, with_field
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from nnap_em.commands import cli
 from nnap_em.commands import identify as identify_command
 from nnap_em.data.dataset import DataError
-from nnap_em.data.formats import LARGEST_FILE, read_table
+from nnap_em.data.formats import LARGEST_FILE
 from nnap_em.em.loop import FitError
 
 MODEL = 'type = "pendulum"\nm = 0.5\nlc = 0.4\nI = 0.002\ng = 9.81\nfriction = "unknown"\nactuated_joint = 1\n'

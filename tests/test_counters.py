@@ -5,12 +5,12 @@ import shlex
 
 import numpy as np
 import pytest
-from helpers import pendulum_rig, rig_text, swing_rig
+from helpers import pendulum_rig, read_table, rig_text, swing_rig
 
 from nnap_em.commands import cli
 from nnap_em.data.counters import counter, unwrapped
 from nnap_em.data.dataset import DataError
-from nnap_em.data.formats import read_table, write_csv
+from nnap_em.data.formats import write_csv
 from nnap_em.data.logs import read_logs
 
 T = 0.01 * np.arange(601)

@@ -14,13 +14,13 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 import scipy.io
-from helpers import csv_text, data_sets, swing, swing_rig, with_field
+from helpers import csv_text, data_sets, read_table, swing, swing_rig, with_field
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from nnap_em.commands.common import write_states
 from nnap_em.data.dataset import DataError, Dataset, fill_missing, horizon, pad
-from nnap_em.data.formats import read_table, write_csv
+from nnap_em.data.formats import write_csv
 from nnap_em.data.logs import DataWarning, check_split, logs_of_arrays, read_logs, sequences_of
 from nnap_em.data.rig import Rig, read_rig
 from nnap_em.storage.files import StoreError

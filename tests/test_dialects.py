@@ -367,9 +367,11 @@ def test_structs_with_different_clocks_are_refused_and_columns_of_a_matrix_have_
 
 def test_a_plain_csv_file_is_none_of_another_dialect(tmp_path):
     for header in ("time,u,theta1", "time,/a/b,c:d", "a,time,b"):
-        assert not text_file.foreign(dialects.table(tmp_path / "a.csv", header, (T, U, Q)))
+        assert text_file.plain_csv(dialects.table(tmp_path / "a.csv", header, (T, U, Q)))
     for header in ('time,"a, b",c', "time,a,a", "# time,a,b"):
-        assert text_file.foreign(dialects.table(tmp_path / "a.csv", header, (T, U, Q)))
+        assert not text_file.plain_csv(dialects.table(tmp_path / "a.csv", header, (T, U, Q)))
+    found = text_file.layout(["Date;Time;u;q", *9 * ["03.11.2026;12:00:00,5;0,5;1,5"]])
+    assert found and (found.marks, found.first, found.clocks) == ((";", ","), 1, (1,))
 
 
 @pytest.mark.parametrize("rows", [0, 1])
@@ -403,7 +405,7 @@ def test_any_text_is_read_or_refused(tmp_path_factory, rows, separator):
         path = tmp_path_factory.getbasetemp() / f"any.{suffix}"
         path.write_text("\n".join(separator.join(row) for row in rows))
         try:
-            text_file.foreign(path)
+            text_file.plain_csv(path)
             wanted = {topic.name: topic.fields for topic in table_file.topics(path)}
             for track in table_file.read(path, wanted).tracks.values():
                 assert (np.diff(track.t) > 0).all()

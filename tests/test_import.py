@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import nnap, pendulum_rig
+from helpers import nnap, pendulum_rig, read_table
 from recorders import JOINTS, MULTI, TOPICS, arrays, joint_states, ns, plain_json, ros2, write_hdf5, write_mcap
 
-from nnap_em.data.formats import read_table, write_csv
+from nnap_em.data.formats import write_csv
 from nnap_em.data.logs import read_logs
 from nnap_em.data.machine import unpacked
 from nnap_em.data.rig import read_rig

@@ -15,9 +15,9 @@ import argparse
 from pathlib import Path
 
 from ..data.dataset import DataError
-from ..data.formats import column_names, dated_csv
+from ..data.formats import csv_table
 from ..import_.recording import last_word
-from ..import_.text_file import foreign
+from ..import_.text_file import plain_csv
 from ..init.equations import draft_equations
 from ..init.from_log import draft
 from ..init.from_machine import draft_machine
@@ -48,6 +48,4 @@ def run(args: argparse.Namespace, log: Log) -> None:
 
 def _ours(path: Path) -> bool:
     """True for a CSV file that may stand in train/ as it is, but for names and units."""
-    if path.suffix.lower() != ".csv" or not path.is_file() or foreign(path):
-        return False
-    return all(last_word(name) == name for name in column_names(path)) and not dated_csv(path)
+    return plain_csv(path) and all(last_word(name) == name for name in csv_table(path).names)

@@ -22,7 +22,7 @@ from .dataset import Array, DataError
 from .dates import dated, moments
 from .mat_structs import mat_columns
 from .rig import nearest
-from .units import clock_of, is_time
+from .units import is_time
 
 LARGEST_FILE = 256 * 2**20  # bytes of the file of one sequence: some million rows
 BLOCK = 20_000  # rows whose fields are split at once, which take some 40 times the memory of their text
@@ -49,20 +49,6 @@ def log_files(folder: Path) -> list[Path]:
         if one.stem == two.stem:
             raise DataError(f"{two}: there is a {one.name} beside it, maybe of the same sequence; remove or rename one")
     return files
-
-
-def read_table(path: Path, required: Sequence[str], gaps: Sequence[str] = ()) -> Table:
-    """The columns `required`, then `gaps`, of the log of a sequence; NaN where one of `gaps` is missing.
-
-    Raises DataError that names the row and the column.
-    """
-    check_size(path)
-    return columns_of(table_of(path), required, gaps)
-
-
-def column_names(path: Path) -> list[str]:
-    """The names of the columns of a log, in the order of the file."""
-    return split(text_lines(path)[0]) if path.suffix.lower() == ".csv" else list(table_of(path).names)
 
 
 def table_of(path: Path) -> "TextTable | ArrayTable":
@@ -143,14 +129,6 @@ def header_hint(path: Path) -> str | None:
         return "line 1 holds numbers: write a header"
     above = "remove the lines above the header" if first.count(",") < last.count(",") else None
     return _separator_hint(first, last) or above
-
-
-def dated_csv(path: Path) -> bool:
-    """True for a CSV file whose times are dates or times of day."""
-    lines = text_lines(path)
-    names, row = split(lines[0]), split("".join(lines[1:2]))
-    clock = clock_of(names)[0]
-    return clock is not None and len(row) == len(names) and not _is_number(row[names.index(clock)])
 
 
 def untimed(names: Sequence[str]) -> str | None:

@@ -32,11 +32,16 @@ class Layout(NamedTuple):
     """Interval of the rows [s], of a table without times that states it."""
 
 
-def foreign(path: Path) -> bool:
-    """True for a text table that is no plain CSV file."""
+def plain_csv(path: Path) -> bool:
+    """True for a CSV file whose numbers can be read as those of a data set are: it has no dates either."""
+    if path.suffix.lower() != ".csv" or not path.is_file():
+        return False
     lines = text_lines(path)
-    found = layout(lines)
-    return lines[0].startswith(CODESYS) if found is None else not plain(lines, found)
+    found, names, row = layout(lines), split(lines[0]), split("".join(lines[1:2]))
+    clock = clock_of(names)[0]
+    dated = clock is not None and len(row) == len(names) and _kind(row[names.index(clock)], ".") < 0
+    # What is wrong with a file of no layout is said by those who read a data set
+    return not dated and (plain(lines, found) if found else not lines[0].startswith(CODESYS))
 
 
 def plain(lines: Sequence[str], found: Layout) -> bool:
@@ -50,7 +55,8 @@ def layout(lines: Sequence[str]) -> Layout | None:
     """The layout that the first lines of a file show; None where no row of numbers stands under names."""
     lines = lines[:200]  # headers have some dozens
     every = {marks: [[_kind(text, marks[1]) for text in _split(line, marks[0])] for line in lines] for marks in MARKS}
-    marks = max(MARKS, key=lambda each: sum(sum(row) for row in every[each] if len(row) - row.count(0) > 1))
+    score = lambda row: row.count(1) - row.count(-1) / 2 if len(row) - row.count(0) > 1 else 0  # noqa: E731
+    marks = max(MARKS, key=lambda each: sum(map(score, every[each])))
     kinds, widths = every[marks], Counter(map(len, every[marks]))
     full = max(reversed(kinds), key=lambda row: row.count(1) * (widths[len(row)] > 1))
 

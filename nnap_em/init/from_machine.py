@@ -9,13 +9,12 @@ import numpy as np
 from jaxtyping import Float
 
 from ..data.dataset import DataError
-from ..data.formats import dated_csv
 from ..data.machine import SENSE_UNITS, Machine, machine_unit, packed, states
 from ..data.rig import SystemSpec, dotted_key, toml_text
 from ..data.servo import TORQUE
 from ..import_.files import reader
 from ..import_.recording import Address, Topic, places
-from ..import_.text_file import foreign
+from ..import_.text_file import plain_csv
 from ..machines.locked import Part
 from ..machines.mjcf import read_machine
 from ..machines.source import parse
@@ -132,7 +131,7 @@ def _inputs(machine: Machine, topics: Sequence[Topic]) -> dict[str, tuple[Addres
 
 def _table(path: Path, columns: Mapping[str, Address]) -> dict[str, Float[np.ndarray, " time"]]:
     """Some of the log on uniform rows; of a CSV file its own."""
-    if path.suffix.lower() != ".csv" or foreign(path) or dated_csv(path):
+    if not plain_csv(path):
         return columns_table(path, columns)
     table = numbers(path)
     time = next((table[name] for name in table if meaning(name).kind == "time"), None)

@@ -1,6 +1,6 @@
 """Tests of the innovations of a fit, channel by channel: each with a size and a sentence for the report.
 
-Innovations of a right model are white, normal, of variance 1, and independent of inputs, states and time.
+Innovations of a right model are white, of variance 1, and independent of inputs, states and time.
 [Bar-Shalom, Li & Kirubarajan 2001, "Estimation with Applications to Tracking and Navigation", section 5.4]
 """
 
@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from .residual import Names, Residual
-from .statistics import FAILS, LAGS, bias, dependence, holm, normality, spread, whiteness
+from .statistics import FAILS, LAGS, dependence, holm, spread, whiteness
 
 
 class Test(NamedTuple):
@@ -23,8 +23,8 @@ class Test(NamedTuple):
     p_value: float
     """Corrected for the number of tests [Holm 1979]."""
     size: float
-    """Distance from a right model, whatever the number of samples: largest autocorrelation; excess kurtosis; standard
-    deviation minus 1; mean over standard deviation; correlation."""
+    """Distance from a right model, whatever the number of samples: largest autocorrelation; standard deviation minus 1;
+    correlation."""
     meaning: str
     """The result in one sentence."""
     slight: bool
@@ -51,6 +51,15 @@ def causes(residual: Residual, names: Names) -> Iterator[tuple[str, Float[np.nda
     yield "time", residual.t
 
 
+KINDS = {  # of each test what is said where it passes, and where it fails; a correlation has its cause
+    "whiteness": ("are uncorrelated over time", "are correlated over time (up to {size:.2g}): {how}"),
+    "spread": ("are as large as the model expects", "are {times:.3g} times as large as the model expects"),
+    "correlation": ("show no link with {cause}", "change with {cause} (correlation {size:.2g})"),
+}
+SMALL_MISFIT = 0.1
+"""Size below which a failed test is called small."""
+
+
 def tests(residual: Residual, names: Names) -> list[Test]:
     """All tests of the innovations of every measured channel, over the sequences that did not diverge."""
     residual = residual.followed()
@@ -59,50 +68,14 @@ def tests(residual: Residual, names: Names) -> list[Test]:
         e = residual.innovation[..., i] if residual.t.size else np.zeros((0, 0))
         if np.isfinite(e).sum() < 3 * LAGS or not np.nanstd(e) > 0:
             continue
-        rows += [("whiteness", channel, whiteness(e)), ("normality", channel, normality(e))]
-        rows += [("spread", channel, spread(e)), ("mean", channel, bias(e))]
+        rows += [("whiteness", channel, whiteness(e)), ("spread", channel, spread(e))]
         rows += [(f"correlation with {name}", channel, dependence(e, g)) for name, g in causes(residual, names)]
-    corrected = holm([p for _, _, (_, p, _) in rows])
     out = []
-    # Sizes below which a failed test is called small
-    small_misfit = {"whiteness": 0.1, "normality": 1.0, "spread": 0.1, "mean": 0.1, "correlation": 0.1}
-    for (name, channel, (statistic, _, size)), p in zip(rows, corrected, strict=True):
-        slight = bool(p < FAILS and abs(size) < small_misfit[name.split()[0]])
-        out.append(
-            Test(
-                name, channel, statistic, float(p), size, _meaning(name, channel, bool(p < FAILS), size, slight), slight
-            )
-        )
+    for (name, channel, (statistic, _, size)), p in zip(rows, holm([p for _, _, (_, p, _) in rows]), strict=True):
+        kind, _, cause = name.partition(" with ")
+        slight = bool(p < FAILS and abs(size) < SMALL_MISFIT)
+        how = "something acts that lasts" if size > 0 else "they alternate, as with filtered readings"
+        said = KINDS[kind][int(p < FAILS)].format(size=size, times=1 + size, how=how, cause=cause)
+        text = f"Errors in {channel} {said}{'; certain, but small' if slight else ''}."
+        out.append(Test(name, channel, statistic, float(p), size, text, slight))
     return out
-
-
-def _meaning(name: str, channel: str, bad: bool, size: float, slight: bool) -> str:
-    kind = name.split()[0]
-    if kind == "correlation":
-        cause = name.removeprefix("correlation with ")
-        passed = f"Errors in {channel} show no link with {cause}."
-        failed = f"Errors in {channel} change with {cause} (correlation {size:.2g})."
-    else:
-        passed, failed = {
-            "whiteness": (
-                f"Errors in {channel} are uncorrelated over time.",
-                f"Errors in {channel} are correlated over time (up to {size:.2g}): "
-                f"{'something acts that lasts' if size > 0 else 'they alternate, as with filtered readings'}.",
-            ),
-            "normality": (
-                f"Errors in {channel} are bell-shaped.",
-                f"Errors in {channel} have {'more' if size > 0 else 'fewer'} outliers than a bell curve, or lean to a "
-                f"side (excess kurtosis {size:.2g}).",
-            ),
-            "spread": (
-                f"Errors in {channel} are as large as the model expects.",
-                f"Errors in {channel} are {1 + size:.3g} times as large as the model expects.",
-            ),
-            "mean": (
-                f"Errors in {channel} average to zero.",
-                f"Errors in {channel} lean to one side (by {size:.2g} standard deviations).",
-            ),
-        }[kind]
-    if not bad:
-        return passed
-    return failed[:-1] + "; certain, but small." if slight else failed

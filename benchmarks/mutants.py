@@ -401,7 +401,7 @@ rest of a law at another joint
 a law takes the place of its like
 - jax.tree.structure(model.effects[i]) != jax.tree
 + jax.tree.structure(model.effects[i]) == jax.tree
-## test_rounds.py::test_a_round[a law at its other joint]
+## test_search.py::test_a_round[a law at its other joint]
 a law is stated at the first place
 - plain(one) == plain(other)
 + plain(one) != plain(other)
@@ -641,7 +641,7 @@ nuisance not projected out of the columns
 a prior that draws the change to zero
 - nuisance.T @ error - pull)
 + nuisance.T @ error)
-## test_rounds.py::test_a_round[a law within twice the chance level]
+## test_search.py::test_a_round[a law within twice the chance level]
 chance does not raise the bar
 - return max(self.floor, CHANCE * self.chance)
 + return self.floor
@@ -689,7 +689,7 @@ free laws before named ones
 a suspect within what chance does
 - max(SUSPECT * floor, CHANCE * chance)
 + SUSPECT * floor
-## test_rounds.py::test_a_round[another cause that is not]
+## test_search.py::test_a_round[another cause that is not]
 a bump is a ripple
 - if value >= EQUIVALENT * max(values)]
 + if value >= 0.6 * max(values)]
@@ -698,10 +698,13 @@ a column of the nuisance is a candidate
 - and survived >= SURVIVES
 + and survived >= 0
 # diagnosis/context.py
-## test_search.py::test_a_fit_that_predicts_worse_than_what_it_began_from_is_not_kept
+## test_search.py::test_the_fit_of_the_least_error_is_kept_the_likelier_of_near_ones_and_none_that_predicts_worse
 a fit that predicts worse is kept
--     if min(left) <= 1:
-+     if min(left) >= 1:
+- a, near) if min(left) <= 1 else None
++ a, near)
+the worst of two fits is kept
+- if share <= min(left) + LEAST_FALL
++ if share >= min(left) + LEAST_FALL
 ## test_search.py::test_one_fit_is_ahead_of_another_by_what_it_is_likelier_less_a_sixth_at_either_end
 trimmed sum not rescaled
 - cut : gain.size - cut]) * gain.size)
@@ -711,39 +714,39 @@ the fit that is behind wins
 - np.nan_to_num(a, nan=-1e3) - np.nan_to_num(b, nan=-1e3)
 + np.nan_to_num(b, nan=-1e3) - np.nan_to_num(a, nan=-1e3)
 # diagnosis/rounds.py
-## test_rounds.py::test_a_round[a function where they have not]
+## test_search.py::test_a_round[a function where they have not]
 a free function is a change whatever the errors
 - law.named or context.functions
 + True
-## test_rounds.py::test_a_round[even after the refit too]
+## test_search.py::test_a_round[even after the refit too]
 the weakest of even laws leads
 - simplest(worths, _complexities(admissible, model), values)
 + simplest(worths, _complexities(admissible, model), [-value for value in values])
-## test_rounds.py::test_a_round[the best of a kind]
+## test_search.py::test_a_round[the best of a kind]
 the weakest of a kind stands for it
 - best[key].rank < screened.rank
 + best[key].rank > screened.rank
-## test_rounds.py::test_a_round[another cause explaining the same]
+## test_search.py::test_a_round[another cause explaining the same]
 laws of one cause leave the question open
 - of_best.isdisjoint(of_one)
 + not of_best.isdisjoint(of_one)
-## test_rounds.py::test_suspects_are_near_the_best_and_over_chance_with_named_laws_first
+## test_search.py::test_suspects_are_near_the_best_and_over_chance_with_named_laws_first
 free suspects before named ones
 - near.sort(key=lambda s: not s.candidate.start.named)
 + near.sort(key=lambda s: s.candidate.start.named)
 # diagnosis/backward.py
 ## test_search.py::test_a_law_goes_without_which_too_little_is_lost
 the most needed law is tried without
-- np.argmin([one.lost for one in reduced])
-+ np.argmax([one.lost for one in reduced])
+- least = int(np.argmin(lost))
++ least = int(np.argmax(lost))
 ## test_search.py::test_what_explains_clearly_more_takes_the_place_of_a_law
 a worse law takes the place of another
-- if lead > 1:
-+ if lead < 1:
+- if ahead > 1:
++ if ahead < 1:
 # diagnosis/search.py
 ## test_search.py::test_a_law_that_is_not_determined_as_it_is_stated_is_a_suspect
 two recordings are as sure as many
-- max(len(context.data.t) - 1, 1)
+- max(recordings - 1, 1)
 + math.inf
 ## test_search.py::test_a_named_law_gives_way_to_a_remainder_that_explains_the_larger_part
 a law stays beside any remainder
@@ -753,26 +756,31 @@ a law stays beside any remainder
 a round that fails loses what was found
 - return _Searched(hypothesis, state, steps, complete=False, failure=_told(context, error))
 + return _Searched(hypothesis, None, steps, complete=False, failure=_told(context, error))
-## test_search.py::test_external_disturbances_are_sought_where_noise_is_not_what_the_model_says
+## test_loop.py::test_a_spring_is_named_and_sized
 external disturbances sought in white noise
 -     if not white:
 -         diagnosis = diagnosis._replace(interventions=_pushed
 +     if white:
 +         diagnosis = diagnosis._replace(interventions=_pushed
-# diagnosis/trial.py
-## test_rounds.py::test_the_start_of_a_law_whose_step_removes_most_is_refitted_if_that_is_enough
+# diagnosis/verdict.py
+## test_search.py::test_the_start_of_a_law_whose_step_removes_most_is_refitted_if_that_is_enough
 a refit without a look
-- if bar and not needed(foreseen,
-+ if bar and needed(foreseen,
-the motion of a joint that is not read must not follow a law
-- bar = 0.0 if hypothesis.model.hides else required(
-+ bar = required(
-## test_rounds.py::test_the_start_of_a_law_whose_step_removes_most_is_refitted_if_that_is_enough
+- needed(share, FORESEEN * required(floor, complexity))
++ needed(share, 0 * required(floor, complexity))
+the motion of a joint that is not read must follow a law
+- return hidden or needed(share,
++ return needed(share,
+# diagnosis/trial.py
+## test_search.py::test_the_start_of_a_law_whose_step_removes_most_is_refitted_if_that_is_enough
 the worst start of a law
-- (_, foreseen), screened, full, start = max(
-+ (_, foreseen), screened, full, start = min(
+- return max(begun, key
++ return min(begun, key
+## test_loop.py::test_a_spring_is_named_and_sized
+no law is refitted
+- if not foreseen(share,
++ if foreseen(share,
 # diagnosis/rounds.py
-## test_rounds.py::test_a_round[another start]
+## test_search.py::test_a_round[another start]
 a law from one start
 - near = [s for s in same if s.share.least >= EQUIVALENT * law.share.least]
 + near = [law]
@@ -784,10 +792,10 @@ a bump is a cogging
 # diagnosis/backward.py
 ## test_search.py::test_a_law_of_a_rate_is_judged_by_that_reading_too
 a law of a rate is judged by the coordinates alone
-- judged.append((0, (own,)))
-+ judged.append((0, ()))
+- every.append((0, (own,)))
++ every.append((0, ()))
 # diagnosis/rounds.py
-## test_rounds.py::test_a_round[a law that is not refitted]
+## test_search.py::test_a_round[a law that is not refitted]
 laws without a refit fill the shortlist
 - for case in tried if case.refit is not None)
 + for case in tried)

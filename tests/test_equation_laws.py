@@ -18,18 +18,17 @@ from nnap_em.diagnosis import equations
 from nnap_em.diagnosis.equations import FOLDS, Case, folds, search_equations
 from nnap_em.diagnosis.findings import suspected
 from nnap_em.diagnosis.outcome import Diagnosis, Step, Suspect
-from nnap_em.effects import Candidate, OperatingPoint, SensorEffect, catalogue, flat
+from nnap_em.effects import Candidate, OperatingPoint, SensorEffect, catalogue
 from nnap_em.effects.equations import UnknownTerm
 from nnap_em.em.equations import free_term, motion, unknown_terms
+from nnap_em.em.prior import ParameterPrior
 from nnap_em.em.simulated import Simulated, Windows
 from nnap_em.fit.identify import begin, identify
 from nnap_em.init.equations import draft_equations
-from nnap_em.model.simulate import paper_model
-from nnap_em.model.state_space import Inputs, StateSpaceModel
+from nnap_em.model.state_space import Inputs
 from nnap_em.report.document import unknown_terms as reported_terms
 from nnap_em.report.fit_plots import term_figure
-from nnap_em.systems import Equations, register_equations, specs
-from nnap_em.systems.acrobot import table_i
+from nnap_em.systems import Equations, specs
 
 PLANT = {
     "states": {"a": "m", "b": "m"}, "inputs": {"u": "V"}, "rates": {"a": "u - a", "b": "a - b"}, "readings": {},
@@ -99,35 +98,33 @@ def _case(left, numbers, share, error):
     return Case((Candidate(start, (), start),), of, 0.0, share=share, left=left)
 
 
-@pytest.mark.parametrize(("left", "chosen"), [(1.05, 1), (1.15, 2)])
-def test_of_laws_as_likely_that_of_fewer_numbers_is_chosen(left, chosen):
-    """100 independent errors: 5 nat are a tenth of the squared error."""
+def test_of_laws_as_likely_that_of_fewer_numbers_is_chosen():
+    """100 independent errors: 5 nat are a tenth of the squared error; of one, nine tenths of the best share decide."""
     error = np.random.default_rng(0).choice([-1.0, 1.0], (1, 1, 100, 1))
     error[0, 0, 1::2] = -error[0, 0, ::2]  # neighbours never alike: all are independent
-    cases = [_case(1.0, 2, 0.9, error), _case(left, 1, 0.89, error)]
-    assert equations._chosen(cases)[0].numbers == chosen
+    for left, numbers in ((1.05, 1), (1.15, 2)):
+        cases = [_case(1.0, 2, 0.9, error), _case(left, 1, 0.89, error)]
+        assert equations._chosen(cases)[0].numbers == numbers
+    for share, numbers in ((0.46, 1), (0.44, 2)):
+        cases = [_case(0.5, 2, 0.5, np.ones((1, 1, 100, 1))), _case(0.55, 1, share, np.ones((1, 1, 100, 1)))]
+        assert equations._chosen(cases)[0].numbers == numbers
 
 
-@pytest.mark.parametrize(("share", "chosen"), [(0.46, 1), (0.44, 2)])
-def test_a_simpler_law_that_removes_clearly_less_is_not_chosen(share, chosen):
-    """One independent error makes no law likelier; nine tenths of the best share decide."""
-    cases = [_case(0.5, 2, 0.5, np.ones((1, 1, 100, 1))), _case(0.55, 1, share, np.ones((1, 1, 100, 1)))]
-    assert equations._chosen(cases)[0].numbers == chosen
+def test_a_strength_that_is_not_determined_is_refused():
+    """100 independent errors of size one, three of whose precision and the prior of one determine it to a half."""
+    error = np.random.default_rng(0).choice([-1.0, 1.0], (1, 1, 100, 1))
+    error[0, 0, 1::2] = -error[0, 0, ::2]
+    system = Equations({}, json.dumps(PLANT))
+    for strength, determined in ((0.95, False), (1.05, True)):
+        law, start = (catalogue["linear_flow"](strength=x, channel="a", reads=("a",)) for x in (strength, 0.0))
+        case = _case(1.0, 1, 0.9, error)
+        columns = np.stack([np.full(error.shape, np.sqrt(0.03)), *2 * [np.zeros(error.shape)]], axis=-1)
+        model, prior = SimpleNamespace(effects=(law.lean(system),)), ParameterPrior((), jnp.zeros(3), jnp.ones(3))
+        of = case.of._replace(model=model, prior=prior, z=np.zeros(3), columns=columns)
+        assert equations._certain(case._replace(of=of, laws=(Candidate(start, (law,), start),))) == determined
 
 
-@pytest.mark.parametrize(("strength", "determined"), [(1.9, False), (2.1, True)])
-def test_a_strength_that_is_not_determined_is_refused(monkeypatch, strength, determined):
-    """A standard deviation of one: two of them are asked for."""
-    law, start = (catalogue["linear_flow"](strength=x, channel="a", reads=("a",)) for x in (strength, 0.0))
-    numbers = flat(law).size
-    of = SimpleNamespace(prior=SimpleNamespace(std=np.ones(numbers)), model=SimpleNamespace(effects=(law,)))
-    monkeypatch.setattr(equations.simulated, "precision", lambda of: np.eye(numbers))
-    monkeypatch.setattr(Case, "effects", (law,))
-    case = Case((Candidate(start, (law,), start),), of, 0.0)  # type: ignore[arg-type]
-    assert equations._certain(case) == determined
-
-
-def test_noise_of_readings_is_no_room_for_laws(tmp_path):
+def test_noise_of_readings_is_no_room_for_laws():
     rng, slow = np.random.default_rng(0), np.sin(np.arange(400) / 20)[None, None, :, None]
     data = _logs(0.0)
     search = equations.Search(None, data._replace(y=jnp.full_like(data.y, jnp.nan)), print, 0.0)  # type: ignore[arg-type]
@@ -170,6 +167,13 @@ def _rig(folder: Path, unknown: str = ""):
     return read_rig(folder / "rig.toml", specs)
 
 
+@pytest.fixture(scope="module")
+def chain(tmp_path_factory):
+    """The chain without the flow that acts in its log, fitted to it, and that log."""
+    data = _logs(0.25, 160)
+    return identify(_rig(tmp_path_factory.mktemp("chain")), data, key=jax.random.key(0)), data
+
+
 def _logs(coupling: float, rows: int = 400, noise: float = 0.02):
     """Euler steps of a millisecond of the declared equations, and a flow in proportion to b^2 out of a."""
     rng, dt = np.random.default_rng(1), 0.5
@@ -183,11 +187,10 @@ def _logs(coupling: float, rows: int = 400, noise: float = 0.02):
     return pad([(dt * np.arange(rows), u[:, None], y)])
 
 
-def test_an_unknown_term_does_not_compete_with_the_parameters(tmp_path):
+def test_an_unknown_term_does_not_compete_with_the_parameters(chain):
     """The changes of the rates by its basis, along the motion, are orthogonal to those by the parameters."""
-    data = _logs(0.0)
-    model = begin(_rig(tmp_path), data, key=jax.random.key(0)).model
-    seen = motion(model, data)
+    model = chain[0].model
+    seen = motion(model, chain[1])
     term = free_term(model.system, seen, ("k", "ta"), "a", ("a", "u"), seen.x.min(axis=0), seen.x.max(axis=0))
     values = jnp.asarray(np.stack([seen.x[:, 0], seen.u[:, 0]], axis=1))
     basis = np.asarray(jax.vmap(term.grid)(values)) @ np.asarray(term.basis).T
@@ -197,11 +200,9 @@ def test_an_unknown_term_does_not_compete_with_the_parameters(tmp_path):
     assert term.weights.shape == (25 - 2,)
 
 
-def test_a_declared_unknown_term_is_part_of_the_model(tmp_path):
-    data = _logs(0.0)
-    fitted = begin(
-        _rig(tmp_path, '[model.unknown]\nf = { signals = ["b"], enters = "a" }'), data, key=jax.random.key(0)
-    )
+def test_a_declared_unknown_term_is_part_of_the_model(chain, tmp_path):
+    rig = _rig(tmp_path, '[model.unknown]\nf = { signals = ["b"], enters = "a" }')
+    fitted = begin(rig, data := chain[1], key=jax.random.key(0))
     (term,) = fitted.model.effects
     assert (term.channel, term.reads, term.label) == ("a", ("b",), "f")
     assert fitted.m_step.prior.names == ("k", "ta", "0.weights")
@@ -233,13 +234,12 @@ def test_a_missing_flow_is_named_and_nothing_where_nothing_is_missing(tmp_path, 
     assert {(effect.channel, effect.reads) for effect in closed.after.model.effects} == names
 
 
-def test_a_search_that_fails_late_or_is_out_of_time_keeps_what_it_has(tmp_path, monkeypatch):
+def test_a_search_that_fails_late_or_is_out_of_time_keeps_what_it_has(chain, monkeypatch):
     """Fits of sensors are singular, fits of two laws are out of time: the flow that was found first is reported."""
-    data, whole = _logs(0.25, 200), equations.simulated.fit_all
+    (before, data), whole = chain, equations.simulated.fit_all
     monkeypatch.setattr(equations, "PARTNERS", 2)  # one pair in place of 120
-    few = {name: catalogue[name] for name in ("linear_flow", "square_flow", "sensor_bend")}
+    few = {name: catalogue[name] for name in ("square_flow", "sensor_bend")}
     monkeypatch.setattr(equations, "catalogue", few)
-    before = identify(_rig(tmp_path), data, key=jax.random.key(0))
 
     def failing(models, *rest, **options):
         if len(models[0].effects) > 1:
@@ -263,36 +263,6 @@ def test_a_suspect_of_equations_states_no_chance():
     step = Step(9, (), (), None, 3, suspects=(Suspect(key, 0.12, math.nan),))
     (suspect,) = suspected(Diagnosis(None, None, (), (step,)))  # type: ignore[arg-type]
     assert suspect.description.endswith("would remove 12% of the squared prediction error")
-
-
-def test_an_acrobot_as_equations_moves_as_the_built_in_one():
-    """To 1e-12, friction included."""
-    built = paper_model()
-
-    def rate(x, u, p):
-        m22, c2 = p.I2 + p.m2 * p.lc2**2, p.m2 * p.l1 * p.lc2
-        m12 = m22 + c2 * jnp.cos(x.theta2)
-        m11 = p.I1 + p.m1 * p.lc1**2 + p.m2 * p.l1**2 + m12 + c2 * jnp.cos(x.theta2)
-        outer = p.m2 * p.lc2 * p.g * jnp.sin(x.theta1 + x.theta2)
-        h = c2 * jnp.sin(x.theta2)
-        friction = built.unknown(jnp.stack([x.dtheta1, x.dtheta2]))
-        f1 = friction[0] + h * x.dtheta2 * (2 * x.dtheta1 + x.dtheta2) - outer
-        f1 = f1 - (p.m1 * p.lc1 + p.m2 * p.l1) * p.g * jnp.sin(x.theta1)
-        f2 = u.u + friction[1] - outer - h * x.dtheta1**2
-        free = m11 * m22 - m12**2
-        a1, a2 = (m22 * f1 - m12 * f2) / free, (m11 * f2 - m12 * f1) / free
-        return {"theta1": x.dtheta1, "theta2": x.dtheta2, "dtheta1": a1, "dtheta2": a2}
-
-    states = {"theta1": "rad", "theta2": "rad", "dtheta1": "rad/s", "dtheta2": "rad/s"}
-    register_equations("test_acrobot", rate, states=states, inputs={"u": "N m"}, parameters=tuple(table_i))
-    text = {**PLANT, "states": states, "inputs": {"u": "N m"}, "rates": {}, "function": "test_acrobot"}
-    text |= {"parameters": list(table_i)}
-    system = Equations({name: jnp.asarray(value) for name, value in table_i.items()}, json.dumps(text))
-    model = StateSpaceModel(system, lambda v: v, built.start, built.log_q, built.log_r, (0, 2), built.dt)
-    for seed in range(5):
-        x = jax.random.normal(jax.random.key(seed), (4,)) * jnp.asarray([2.0, 2.0, 4.0, 6.0])
-        u = Inputs.held(jnp.asarray([0.2]))
-        np.testing.assert_allclose(model.transition(x, u), built.transition(x, u), rtol=1e-12, atol=1e-12)
 
 
 def test_a_draft_of_equations_needs_only_the_rates(tmp_path):

@@ -1,13 +1,17 @@
 """The backward pass: laws that are not needed go, and a rival that explains clearly more replaces a law."""
 
+import functools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import NamedTuple, cast
 
 import numpy as np
 
+from ..effects import AbstractEffect, Candidate, SearchScales
 from ..em.multistep import channels
+from ..model.state_space import StateSpaceModel
 from ..numerics.digits import share_of
+from ..storage.log import Log
 from .context import SearchContext, smooth
 from .hypothesis import Evidence, Hypothesis
 from .keys import Key, elsewhere, key_of, remainder_of, words
@@ -17,7 +21,7 @@ from .rounds import best_of_kind
 from .screen import screen
 from .smoothed import SmoothedFit
 from .trial import Null, Trial, null_of, with_candidate
-from .verdict import KEEP, MULTI_STEP, Rejection, needed
+from .verdict import KEEP, MULTI_STEP, Rejection, lead, needed
 
 
 class _Reduced(NamedTuple):
@@ -41,10 +45,11 @@ def backward(context: SearchContext, hypothesis: Hypothesis) -> Hypothesis:
             break
         full = null_of(hypothesis, fit, context.loss, context.effort.passes).end
         reduced = [_without(context, fit, full, place) for place in range(len(hypothesis.evidence))]
-        least = int(np.argmin([one.lost for one in reduced]))
+        least = needless([one.lost for one in reduced])
+        if least is None:
+            of_law = functools.partial(_in_place, context, full, reduced)
+            return compared(hypothesis, of_law, context.log)
         lost = reduced[least].lost
-        if needed(lost, MULTI_STEP):
-            return _compared(context, hypothesis, full, reduced)
         reason = f"without it {share_of(lost, 'the squared error', 1)} is lost, {KEEP * MULTI_STEP:.1%} counts"
         reason = reason if lost > -math.inf else Rejection("impossible").sentence
         context.log(f"  {words(key_of(hypothesis.model.effects[least]))} is removed: {reason}")
@@ -52,11 +57,14 @@ def backward(context: SearchContext, hypothesis: Hypothesis) -> Hypothesis:
     return hypothesis
 
 
-def _without(context: SearchContext, fit: SmoothedFit, full: Refit, place: int) -> _Reduced:
-    """The fit without the effect at `place`, and the share of its squared error that the effect removes at best.
+def needless(lost: Sequence[float]) -> int | None:
+    """Place of the law with which the least share of the squared error goes, where that is too little to count."""
+    least = int(np.argmin(lost))
+    return None if needed(lost[least], MULTI_STEP) else least
 
-    A law of a rate, which is not compared, is judged by the errors of that reading, too.
-    """
+
+def _without(context: SearchContext, fit: SmoothedFit, full: Refit, place: int) -> _Reduced:
+    """The fit without the effect at `place`, and the share of its squared error that the effect removes at best."""
     hypothesis, effects = fit.hypothesis, fit.model.effects
     if (
         hypothesis.evidence[place] is None
@@ -71,30 +79,40 @@ def _without(context: SearchContext, fit: SmoothedFit, full: Refit, place: int) 
     if not both.used.any():  # without it no sequence is followed
         return _Reduced(math.inf)
     null = null_of(both.hypothesis, both, context.loss, context.effort.passes)
-    judged: list[tuple[int, tuple[int, ...]]] = [(band, ()) for band in range(len(context.loss.bands))]
-    measured, channel = context.before.rig.measured, key_of(effects[place])[2]
-    if channel in measured and (own := measured.index(channel)) not in channels(fit.model):
-        # Noise that is fitted without its law makes a rate count for nothing: of others the law then removes nothing
-        judged.append((0, (own,)))
-    return _Reduced(max(1 - context.loss.ratio(null.end, full, both, *one) for one in judged), both, null)
+    errors = judged_by(effects[place], fit.model, context.before.rig.measured, len(context.loss.bands))
+    return _Reduced(max(1 - context.loss.ratio(null.end, full, both, *one) for one in errors), both, null)
 
 
-def _compared(context: SearchContext, hypothesis: Hypothesis, full: Refit, reduced: Sequence[_Reduced]) -> Hypothesis:
-    """The hypothesis after its equivalents, and each law at its other places, stood in the place of their law.
+def judged_by(
+    law: AbstractEffect, model: StateSpaceModel, measured: Sequence[str], bands: int
+) -> list[tuple[int, tuple[int, ...]]]:
+    """Band and readings of the errors by which a law is judged; without readings, of those that are compared.
+
+    Noise that is fitted without a law of a rate makes this rate count for nothing: of others the law removes nothing.
+    """
+    every: list[tuple[int, tuple[int, ...]]] = [(band, ()) for band in range(bands)]
+    if law.channel in measured and (own := measured.index(law.channel)) not in channels(model):
+        every.append((0, (own,)))
+    return every
+
+
+def compared(
+    hypothesis: Hypothesis, rivals: Callable[[int, AbstractEffect, Evidence], Iterable[tuple[Trial, float]]], log: Log
+) -> Hypothesis:
+    """The hypothesis after the `rivals` of each law, with their leads, stood in its place.
 
     One that is clearly worse is no equivalent any more; the first that is clearly better takes the place.
     """
     found = list(hypothesis.evidence)
-    for place, (law, without) in enumerate(zip(hypothesis.model.effects, reduced, strict=True)):
-        evidence, leads = found[place], {}
-        if without.fit is None or without.null is None or evidence is None:
+    for place, (law, evidence) in enumerate(zip(hypothesis.model.effects, hypothesis.evidence, strict=True)):
+        if evidence is None:
             continue
-        for trial in _in_place(context, key_of(law), evidence, without.fit, without.null):
-            key, own = key_of(trial.effect), cast(Refit, trial.refit)
-            lead = -math.inf if trial.rejection else context.loss.lead(without.null.end, full, own, without.fit)
-            leads[key] = max(lead, leads.get(key, -math.inf))
-            if lead > 1:
-                context.log(f"  {words(key)} takes the place of {words(key_of(law))}")
+        leads: dict[Key, float] = {}
+        for trial, ahead in rivals(place, law, evidence):
+            key = key_of(trial.effect)
+            leads[key] = max(ahead, leads.get(key, -math.inf))
+            if ahead > 1:
+                log(f"  {words(key)} takes the place of {words(key_of(law))}")
                 record = evidence._replace(removed=trial.removed, equivalent=(), candidate=trial.candidate)
                 return trial.after._replace(evidence=(*trial.after.evidence[:-1], record))
         same = tuple(key for key in evidence.equivalent if leads.get(key, 0.0) >= -1)
@@ -102,14 +120,34 @@ def _compared(context: SearchContext, hypothesis: Hypothesis, full: Refit, reduc
     return hypothesis._replace(evidence=tuple(found))
 
 
-def _in_place(context: SearchContext, law: Key, evidence: Evidence, fit: SmoothedFit, null: Null) -> Iterator[Trial]:
-    """Refits, in the place of a law, of its equivalents and, beside other laws, of the same law elsewhere: a law alone
-    was compared with that when it was found.  Of each the best candidate.
-    """
+def _in_place(
+    context: SearchContext,
+    full: Refit,
+    reduced: Sequence[_Reduced],
+    place: int,
+    law: AbstractEffect,
+    evidence: Evidence,
+) -> Iterator[tuple[Trial, float]]:
+    """Refits in the place of a law, of each rival the best candidate, with the lead over the `full` fit."""
+    _, fit, null = reduced[place]
+    if fit is None or null is None:
+        return
+    loss = context.loss
     around = surroundings(context.before.rig, fit.model, fit.data, fit.path, fit.rows, change=context.change)
-    every = proposals(around, fit.model.effects)
-    keyed = [(key_of(c.start), c) for c in every if c.start.visible(around)]
-    some = [c for key, c in keyed if key in evidence.equivalent or (fit.model.effects and elsewhere(key, law))]
-    listed = screen(context.loss, fit, some, shifts=0) if some else ()
+    some = rivals_of(law, evidence, proposals(around, fit.model.effects), around, alone=not fit.model.effects)
+    listed = screen(loss, fit, some, shifts=0) if some else ()
+    own = 1 - loss.ratio(null.end, full, fit, 0) if some else 0.0
     for entry in best_of_kind(s for s in listed if s.reached or key_of(s.candidate.start) in evidence.equivalent):
-        yield with_candidate([entry], null, fit, context.loss, context.effort.passes)
+        trial = with_candidate([entry], null, fit, loss, context.effort.passes)
+        its = -math.inf if trial.rejection else 1 - loss.ratio(null.end, cast(Refit, trial.refit), fit, 0)
+        yield trial, lead(own, its)
+
+
+def rivals_of(
+    law: AbstractEffect, evidence: Evidence, every: Sequence[Candidate], around: SearchScales, *, alone: bool
+) -> list[Candidate]:
+    """Candidates that may stand in the place of a law: what explained the same when it was found and, beside other
+    laws, the same law elsewhere; `alone` it was compared with that when it was found.
+    """
+    seen = [(key_of(c.start), c) for c in every if c.start.visible(around)]
+    return [c for key, c in seen if key in evidence.equivalent or (not alone and elsewhere(key, key_of(law)))]

@@ -205,12 +205,21 @@ def _best(context: SearchContext, hypothesis: Hypothesis, fits: Sequence[EMState
         both = used & whole
         after = errors(followed(other.model, other.m_step.prior, other.path, context.data), JUDGED)
         left.append(ratio(before, after, both) if both.any() else 1.0)
-    if min(left) <= 1:
-        near = [one for one, share in zip(fits, left, strict=True) if share <= min(left) + LEAST_FALL]
-        return functools.reduce(lambda a, b: b if ahead(b.top, a.top) > 0 else a, near)
+    place = chosen(left, [one.top for one in fits])
+    if place is not None:
+        return fits[place]
     begun = later_state(hypothesis.model, hypothesis.m_step, key=fits[0].key)
     schedule = Schedule(first=context.longest)
     return fit(begun, context.data, context.before.smoother, hypothesis.m_step, epochs=2, schedule=schedule)
+
+
+def chosen(left: Sequence[float], tops: Sequence[Float[np.ndarray, " seq"]]) -> int | None:
+    """Place of the fit to keep: of those whose squared error is nearly the least, the likeliest.
+
+    `left` are their errors over that of the hypothesis as it stands, which is kept where all predict worse.
+    """
+    near = [i for i, share in enumerate(left) if share <= min(left) + LEAST_FALL]
+    return functools.reduce(lambda a, b: b if ahead(tops[b], tops[a]) > 0 else a, near) if min(left) <= 1 else None
 
 
 def ahead(a: Float[np.ndarray, " seq"], b: Float[np.ndarray, " seq"]) -> float:

@@ -27,7 +27,7 @@ from ..em.readings import reading_noise
 from ..fit.identify import Identified, fitted_to_horizon
 from ..model.state_space import with_effects
 from ..storage.log import Log
-from .hypothesis import Evidence, Hypothesis
+from .hypothesis import Evidence, Hypothesis, covariances
 from .keys import Key, complexity, key_of, words
 from .outcome import Diagnosis, Step, Suspect
 from .trial import certainty
@@ -318,12 +318,8 @@ def _passes(case: Case) -> bool:
 
 def _certain(case: Case) -> bool:
     """True where every strength is determined beside its level and share; parts left out confirm that it is there."""
-    std = np.asarray(case.of.prior.std)
-    cov = np.linalg.inv(simulated.precision(case.of)) * np.outer(std, std)
-    sizes = [flat(effect).size for effect in case.of.model.effects[-len(case.laws) :]]
-    parts = np.split(np.arange(-sum(sizes), 0), np.cumsum(sizes)[:-1])
-    each = zip(case.laws, case.effects, parts, strict=True)
-    return all(certainty(law, effect, cov[np.ix_(part, part)]) >= DETERMINED for law, effect, part in each)
+    spreads = covariances(case.of.model, case.of, simulated.precision(case.of))[-len(case.laws) :]
+    return all(certainty(*each) >= DETERMINED for each in zip(case.laws, case.effects, spreads, strict=True))
 
 
 def _chosen(passing: Sequence[Case]) -> tuple[Case | None, list[Case]]:

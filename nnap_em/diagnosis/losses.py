@@ -35,7 +35,6 @@ from .columns import Blocks, candidate_columns, tracks
 from .hypothesis import Hypothesis
 from .refit import Refit
 from .smoothed import SmoothedFit
-from .verdict import EQUIVALENT
 
 
 class Linearised(NamedTuple):
@@ -120,13 +119,6 @@ class MultiStep(eqx.Module):
         """
         before, after = (errors(cast(Followed, t.along), self.judged[band], see) for t in (null, full))
         return ratio(before, after, fit.used)
-
-    def lead(self, null: Refit, full: Refit, other: Refit, fit: SmoothedFit) -> float:
-        """Distance by which one law explains more than another in its place, both beside a fit without either, over
-        that within which they explain the same.
-        """
-        own, its = (1 - self.ratio(null, one, fit, 0) for one in (full, other))
-        return (its - own) / max((1 - EQUIVALENT) * max(own, its), 1e-12)
 
 
 def _machine(fit: SmoothedFit) -> StateSpaceModel:

@@ -1,7 +1,8 @@
 """One screening round: all candidates are screened, and the best are refitted until one is accepted."""
 
-from collections.abc import Iterable, Sequence
-from typing import NamedTuple, TypeVar, cast
+import functools
+from collections.abc import Callable, Iterable, Sequence
+from typing import NamedTuple, TypeVar
 
 import jax
 import numpy as np
@@ -17,7 +18,7 @@ from .outcome import Step, Suspect
 from .propose import proposals, seeded, surroundings
 from .screen import Screened, screen
 from .smoothed import SmoothedFit
-from .trial import Null, Trial, explained, null_of, with_candidate
+from .trial import Trial, explained, null_of, with_candidate
 from .verdict import EQUIVALENT, NAMED, even, odds, simplest, suspected
 
 _Law = TypeVar("_Law", Screened, Trial)
@@ -36,31 +37,43 @@ class Round(NamedTuple):
 
 def screening_round(fit: SmoothedFit, context: SearchContext) -> Round:
     """Screen everything that the machine may have, and refit the best until one is accepted."""
-    rig, model = context.before.rig, fit.model
-    around = surroundings(rig, model, fit.data, fit.path, fit.rows, change=context.change)
-    seen = screen(context.loss, fit, proposals(around, model.effects))
+    around = surroundings(context.before.rig, fit.model, fit.data, fit.path, fit.rows, change=context.change)
+    seen = screen(context.loss, fit, proposals(around, fit.model.effects))
     fresh = [s for s in seen if s.candidate.start.visible(around) and _fresh(s.candidate.start, fit)]
-    ranked = best_of_kind(s for s in fresh if seeded(s.candidate, s.coefficients).is_physical())
     length = int(np.max(np.sum(np.asarray(fit.data.valid), axis=1)))
-    listed = tuple((key_of(s.candidate.start), _listed(s)) for s in ranked)
-    step = Step(length, listed, (), None, len(seen), context.loss.measure)
+    fitting = fit, context.loss, context.effort.passes
+    null = functools.cache(lambda: null_of(fit.hypothesis, *fitting))
+
+    def refitted(forms: Sequence[Screened]) -> Trial:
+        case = with_candidate(forms, null(), *fitting)
+        case = case if case.rejection else case._replace(before=explained(case, context))
+        _log(case, context)
+        return case
+
+    return decided(fresh, refitted, Step(length, (), (), None, len(seen), context.loss.measure), fit.model, context)
+
+
+def decided(
+    fresh: Sequence[Screened],
+    refitted: Callable[[Sequence[Screened]], Trial],
+    step: Step,
+    model: StateSpaceModel,
+    context: SearchContext,
+) -> Round:
+    """The best laws of a screen, `refitted` from their starts that explain as much, until one is accepted."""
+    ranked = best_of_kind(s for s in fresh if seeded(s.candidate, s.coefficients).is_physical())
+    step = step._replace(screened=tuple((key_of(s.candidate.start), _listed(s)) for s in ranked))
     admitted = [s for s in ranked if s.reached]
     tried: list[Trial] = []
     complete = True
-    fitting = fit, context.loss, context.effort.passes
     try:
-        null = null_of(fit.hypothesis, *fitting) if admitted else None
         while admitted and (left := context.effort.shortlist - len(_removals(tried))) > 0:
             group = _group(admitted, model)[:left]
-            cases: list[Trial] = []
-            for s in group:
-                case = with_candidate(_forms(s, fresh), cast(Null, null), *fitting)
-                cases.append(case if case.rejection else case._replace(before=explained(case, context)))
-                _log(cases[-1], context)
+            cases = [refitted(_forms(s, fresh)) for s in group]
             tried += cases
             admissible = [case for case in cases if case.rejection is None]
             if admissible:
-                return _accepted(admissible, Round(step._replace(refitted=_removals(tried)), None), fit, context)
+                return _accepted(admissible, Round(step._replace(refitted=_removals(tried)), None), model, context)
             admitted = [s for s in admitted if not any(s is other for other in group)]
     except TimeUp:
         complete = False
@@ -87,12 +100,12 @@ def _group(admitted: Sequence[Screened], model: StateSpaceModel) -> list[Screene
     return list({id(s): s for s in group}.values())
 
 
-def _accepted(admissible: list[Trial], outcome: Round, fit: SmoothedFit, context: SearchContext) -> Round:
+def _accepted(admissible: list[Trial], outcome: Round, model: StateSpaceModel, context: SearchContext) -> Round:
     """Choose among refitted laws: the simplest at the place that is worth most, in its simplest form.
 
     None where one that is worth as much is of another cause, nor a free function where no error rose since a fit.
     """
-    model, values = fit.model, [case.removed for case in admissible]
+    values = [case.removed for case in admissible]
     worths = _worths(admissible, values, model)
     leader = admissible[simplest(worths, _complexities(admissible, model), values)]
     best = _form(leader, admissible, values, model)

@@ -4,7 +4,7 @@ import dataclasses
 import math
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, cast
 
 import equinox as eqx
@@ -18,7 +18,7 @@ from ..data.dataset import Dataset, stepped
 from ..data.logs import Logs, sequences_of
 from ..data.rig import Rig
 from ..em.loop import EMState, FitError, e_step
-from ..em.mstep import not_diverged
+from ..em.mstep import ScoringMStep, not_diverged
 from ..em.noise import white_readings
 from ..fit.identify import Identified, begin, finished, identify
 from ..fit.known import forgotten, known, unheld
@@ -62,10 +62,10 @@ def _forward(context: SearchContext, hypothesis: Hypothesis, length: int, steps:
         raise TimeUp
     if outcome.accepted is None:
         return hypothesis
-    return _with(hypothesis, outcome.accepted, _evidence(outcome), context)
+    return joined(hypothesis, outcome.accepted, _evidence(outcome), context)
 
 
-def _with(hypothesis: Hypothesis, case: Trial, evidence: Evidence, context: SearchContext) -> Hypothesis:
+def joined(hypothesis: Hypothesis, case: Trial, evidence: Evidence, context: SearchContext) -> Hypothesis:
     """The hypothesis with a refitted law; a named law gives way to a remainder unless it explains most of both."""
     context.log(f"  added {words(key_of(case.effect))}")
     remainder, form = remainder_of(case.effect, hypothesis.model), replaced(case.effect, hypothesis.model)
@@ -104,8 +104,7 @@ def search(context: SearchContext, *, release: Callable[[Identified, Dataset], I
     except FAILURES as error:
         context.log(f"  with steps of readings as noise the fit fails ({error})")
         begun = context.declared, None
-    lengths = _ladder(context) if context.white and before.model.hides else [_first(context)]
-    hypothesis, state, steps, complete, failure = _search(context, *begun, lengths)
+    hypothesis, state, steps, complete, failure = _search(context, *begun, lengths_of(context))
     outcome = _outcome(before, hypothesis, state)
     try:
         hypothesis, outcome, steps = _determined(context, hypothesis, state, steps, release)
@@ -122,13 +121,7 @@ def _determined(
     steps: list[Step],
     release: Callable[[Identified, Dataset], Identified],
 ) -> tuple[Hypothesis, Identified | None, list[Step]]:
-    """The outcome without laws that are not determined as they are stated, the least sure first: those are suspects.
-
-    The search counts rows by their likelihood, which is surer than recordings agree; of few, the standard deviation is
-    hardly known, and chance is that of Student's t [Cameron & Miller 2015, J. Human Resources 50(2), for clusters].
-    """
-    others = math.inf if context.white else max(len(context.data.t) - 1, 1)
-    chance = stats.t.isf(stats.norm.sf(DETERMINED), others)
+    """The outcome without laws that are not determined as they are stated, the least sure first: those are suspects."""
     while state is not None and any(hypothesis.evidence):
         outcome = release(_outcome(context.before, hypothesis, state), context.data)
         model, found = outcome.model, hypothesis.evidence
@@ -137,8 +130,8 @@ def _determined(
             certainty(one.candidate, effect, cov) if one and one.candidate else math.inf
             for one, effect, cov in zip(found, model.effects, spreads, strict=True)
         ]
-        least = int(np.argmin(sure))
-        if sure[least] > chance:
+        least = doubtful(sure, math.inf if context.white else len(context.data.t))
+        if least is None:
             return hypothesis, outcome, steps
         law, evidence = key_of(model.effects[least]), cast(Evidence, found[least])
         context.log(f"  {words(law)} is removed: it {Rejection('uncertain', sure[least]).sentence}")
@@ -150,23 +143,32 @@ def _determined(
     return hypothesis, None, steps
 
 
-def _ladder(context: SearchContext) -> list[int]:
-    """Rows of the first rounds where a joint is hidden: the two shortest horizons of the fit, and one in the middle.
+def doubtful(sure: Sequence[float], recordings: float) -> int | None:
+    """Place of the law of the least Wald statistic, where that of its stated values shows no law.
 
-    Over the whole length a fit takes a strong effect for process noise: on a simulated arm a spring explains 0.38 of
-    the multi-step error over 0.6 s, less than 0.09 over 5 s. On real arms short horizons named six of 13 laws wrong.
+    The search counts rows by their likelihood, which is surer than recordings agree; of few, the standard deviation is
+    hardly known, and chance is that of Student's t [Cameron & Miller 2015, J. Human Resources 50(2), for clusters].
+    """
+    least = int(np.argmin(sure))
+    chance = stats.t.isf(stats.norm.sf(DETERMINED), max(recordings - 1, 1))
+    return None if sure[least] > chance else least
+
+
+def lengths_of(context: SearchContext) -> list[int]:
+    """Rows of the first rounds: all, or if most sequences diverge before, as many as most keep.
+
+    Where a joint is hidden and readings are white, the two shortest horizons of the fit, and one in the middle: over
+    the whole length a fit takes a strong effect for process noise. On a simulated arm a spring explains 0.38 of the
+    multi-step error over 0.6 s, less than 0.09 over 5 s. On real arms short horizons named six of 13 laws wrong.
     """
     longest = context.longest
-    short = [length for length in sorted(context.stages) if length < longest]
-    middle = [length for length in short if longest / 3 < length < 0.7 * longest]
-    return list(dict.fromkeys([length for length in short if length <= SHORT][:2] + middle[:1]))
-
-
-def _first(context: SearchContext) -> int:
-    """Rows of the first round: all, or if most sequences diverge before, as many as most keep."""
+    if context.white and context.before.model.hides:
+        short = [length for length in sorted(context.stages) if length < longest]
+        middle = [length for length in short if longest / 3 < length < 0.7 * longest]
+        return list(dict.fromkeys([length for length in short if length <= SHORT][:2] + middle[:1]))
     followed = {length: np.mean(used) for length, (_, used) in context.stages.items()}
     most = [length for length, share in followed.items() if share >= FOLLOWED]
-    return max(most, default=min(followed, default=context.longest))
+    return [max(most, default=min(followed, default=longest))]
 
 
 def _outcome(before: Identified, hypothesis: Hypothesis, state: EMState | None) -> Identified:
@@ -279,33 +281,31 @@ def diagnose(
 
     declared = begin(rig, data, key=key).model
     white = white_readings(data, declared)
-    held, hold = _held(rig, declared, white)
+    held, hold = held_in(rig, declared, white)
 
-    def identified(part: Dataset) -> Identified:
-        seen: Stages = {}
+    def watch(state: EMState, rows: int, used: Bool[np.ndarray, " seq"]) -> None:
+        stages[rows] = state, used
+        log(f"epoch {state.epoch}, horizon {rows * rig.dt:.2f} s: {state.loglik[-1]:.1f} nat per sequence")
+
+    def ended(fitted: Identified, data: Dataset) -> Identified:
+        """The end of a fit, whose numbers and posterior were held more tightly in the search than they are stated."""
         if start is not None:
-            outcome, used = _put(start, rig, part, hold, key)
-            stages.clear()
-            stages[int(np.max(np.sum(np.asarray(part.valid), axis=1)))] = outcome.state, used
-            return outcome
-
-        def watch(state: EMState, rows: int, used: Bool[np.ndarray, " seq"]) -> None:
-            seen[rows] = (state, used)
-            log(f"epoch {state.epoch}, horizon {rows * rig.dt:.2f} s: {state.loglik[-1]:.1f} nat per sequence")
-
-        outcome = identify(held, part, key=key, smoother=unbranched, watch=watch)
-        stages.clear()  # a fit that fails leaves the stages of the one before
-        stages.update(seen)
-        return outcome
+            return forgotten(_under(unheld(fitted.m_step, fitted.model, hold), fitted, data))
+        if hold == 1.0:
+            return finished(fitted, data)
+        return _under(released(fitted.m_step), fitted._replace(rig=rig), data)
 
     if len(data.t) < 2 and not rig.equations:
         log("one sequence: only pieces of it can be left out, so that little is accepted; record at least two")
-    before = identified(data)
+    if start is None:
+        before = identify(held, data, key=key, smoother=unbranched, watch=watch)
+    else:
+        before, used = _put(start, rig, data, hold, key)
+        stages[int(np.max(np.sum(np.asarray(data.valid), axis=1)))] = before.state, used
     if rig.equations:
         return search_equations(before, data, log, end)
     change = start is not None
     origin = None if start is None or own is None else along(start, own, unbranched(start.bank))
-    ended = _ended(hold) if change else finished if hold == 1.0 else _released(rig)
     risen = None if origin is None else risen_since(origin, along(before, data, before.smoother))
     context = SearchContext(before, stages, data, MultiStep(), effort, log, end, origin, change, white, risen)
     diagnosis = search(context, release=ended)._replace(risen=risen)
@@ -315,7 +315,7 @@ def diagnose(
         diagnosis = diagnosis._replace(before=before, after=after, change=change)
     if not white:
         diagnosis = diagnosis._replace(interventions=_pushed(diagnosis.after, data, log))
-    return _branching(diagnosis)
+    return branching(diagnosis)
 
 
 def _pushed(fitted: Identified, data: Dataset, log: Log) -> tuple[Intervention, ...]:
@@ -343,20 +343,14 @@ def _put(
     return before._replace(state=before.state._replace(top=top)), used
 
 
-def _ended(hold: float) -> Callable[[Identified, Dataset], Identified]:
-    """End of fits that began from another one: its posterior, held more tightly in the search, counts once."""
-
-    def release(fitted: Identified, data: Dataset) -> Identified:
-        rule = unheld(fitted.m_step, fitted.model, hold)
-        posterior = e_step(fitted.model, data, fitted.smoother.tolerant(), key=fitted.state.key)
-        _, info = rule(fitted.model, posterior, data)
-        state = fitted.state._replace(hessian=info.hessian)
-        return forgotten(finished(fitted._replace(m_step=rule, state=state), data))
-
-    return release
+def _under(rule: ScoringMStep, fitted: Identified, data: Dataset) -> Identified:
+    """The end of a fit under another rule: numbers move by it where that predicts what is left out."""
+    posterior = e_step(fitted.model, data, fitted.smoother.tolerant(), key=fitted.state.key)
+    _, info = rule(fitted.model, posterior, data)
+    return finished(fitted._replace(m_step=rule, state=fitted.state._replace(hessian=info.hessian)), data)
 
 
-def _held(rig: Rig, model: StateSpaceModel, white: bool) -> tuple[Rig, float]:
+def held_in(rig: Rig, model: StateSpaceModel, white: bool) -> tuple[Rig, float]:
     """The rig with declared numbers nearly held, and their standard deviation over the declared one."""
     # Readings that are white do not bend them; a law would stand for what they leave of a motion that is hidden
     if white or rig.equations or model.hides:
@@ -365,20 +359,11 @@ def _held(rig: Rig, model: StateSpaceModel, white: bool) -> tuple[Rig, float]:
     return dataclasses.replace(rig, parameters=narrow), HELD
 
 
-def _released(rig: Rig) -> Callable[[Identified, Dataset], Identified]:
-    """End of fits whose numbers were held: they move under what is declared where that predicts what is left out."""
-
-    def release(fitted: Identified, data: Dataset) -> Identified:
-        rule, model = fitted.m_step, fitted.model
-        own = np.arange(rule.prior.size) < len(rule.prior.declared)
-        std = jnp.where(own, rule.prior.std / HELD, rule.prior.std)
-        rule = eqx.tree_at(lambda r: (r.prior.std, r.least), rule, (std, HELD * rule.least))
-        posterior = e_step(model, data, fitted.smoother.tolerant(), key=fitted.state.key)
-        _, info = rule(model, posterior, data)
-        state = fitted.state._replace(hessian=info.hessian)
-        return finished(fitted._replace(rig=rig, m_step=rule, state=state), data)
-
-    return release
+def released(rule: ScoringMStep) -> ScoringMStep:
+    """The rule of a fit whose numbers were held, with their declared standard deviations."""
+    own = np.arange(rule.prior.size) < len(rule.prior.declared)
+    std = jnp.where(own, rule.prior.std / HELD, rule.prior.std)
+    return eqx.tree_at(lambda r: (r.prior.std, r.least), rule, (std, HELD * rule.least))
 
 
 def unbranched(bank: StartBank) -> GaussianSmoother:
@@ -390,7 +375,7 @@ def unbranched(bank: StartBank) -> GaussianSmoother:
     return CubatureSmoother(bank, branching=False)
 
 
-def _branching(diagnosis: Diagnosis) -> Diagnosis:
+def branching(diagnosis: Diagnosis) -> Diagnosis:
     """The outcome with the smoother of `identify`, by which states are smoothed and predicted."""
 
     def branched(fit: Identified) -> Identified:

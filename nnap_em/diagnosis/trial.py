@@ -1,6 +1,6 @@
 """A candidate after its refit, beside the model without it fitted in the same way."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -18,7 +18,7 @@ from .propose import seeded
 from .refit import Refit, refit
 from .screen import Screened
 from .smoothed import SmoothedFit, extended
-from .verdict import FORESEEN, Rejection, needed, required, veto
+from .verdict import Rejection, foreseen, veto
 
 
 class Trial(NamedTuple):
@@ -82,28 +82,41 @@ def null_of(hypothesis: Hypothesis, fit: SmoothedFit, loss: MultiStep, passes: i
     return Null(start, fitted(start, fit, loss, passes))
 
 
+class Begun(NamedTuple):
+    """A form of a law in the model, at the step of the screen."""
+
+    screened: Screened
+    full: Hypothesis
+    start: Refit
+    foreseen: float
+    """Share of the squared error that the step removes."""
+
+
+def leader(begun: Iterable[Begun]) -> Begun:
+    """The form whose step removes most; those that are not physical come last."""
+    return max(begun, key=lambda form: (form.start.model.effects[-1].is_physical(), form.foreseen))
+
+
 def with_candidate(forms: Sequence[Screened], null: Null, fit: SmoothedFit, loss: MultiStep, passes: int) -> Trial:
     """A law in the model, or in the place of the law that it is another form of, refitted from the one of its `forms`
     whose step removes most and is physical: on the linear screen a friction of three periods may explain what five do.
 
-    Not refitted where every coordinate is read and the nonlinear error hardly falls along the step of the screen,
-    friction and parameters moving with it: the motion of another one was inferred without the law.
+    Not refitted where the nonlinear error hardly falls along the step of the screen, friction and parameters moving
+    with it (`foreseen`).
     """
     hypothesis = fit.hypothesis
 
-    def stepped(form: Screened) -> tuple[tuple[bool, float], Screened, Hypothesis, Refit]:
+    def stepped(form: Screened) -> Begun:
         effect = seeded(form.candidate, form.coefficients)
         place = replaced(effect, hypothesis.model)
         full = (hypothesis if place is None else hypothesis.without(place)).plus(effect, form.candidate)
         start = begun(full, extended(full.model, fit.path, fit.data), fit, loss)
-        share = 1 - loss.ratio(null.start, start, fit, form.band)
-        return (start.model.effects[-1].is_physical(), share), form, full, start
+        return Begun(form, full, start, 1 - loss.ratio(null.start, start, fit, form.band))
 
-    (_, foreseen), screened, full, start = max(map(stepped, forms), key=lambda step: step[0])
+    screened, full, start, share = leader(map(stepped, forms))
     candidate = screened.candidate
-    bar = 0.0 if hypothesis.model.hides else required(screened.floor, complexity(candidate.start))
-    if bar and not needed(foreseen, FORESEEN * bar):
-        return Trial(screened, full.refitted(start.model), foreseen, np.inf, np.inf, foreseen)
+    if not foreseen(share, screened.floor, complexity(candidate.start), hidden=hypothesis.model.hides):
+        return Trial(screened, full.refitted(start.model), share, np.inf, np.inf, share)
     end = fitted(start, fit, loss, passes)
     after = full.refitted(end.model)
     effect, cov = after.model.effects[-1], covariances(after.model, after.m_step, end.hessian)[-1]
@@ -114,7 +127,7 @@ def with_candidate(forms: Sequence[Screened], null: Null, fit: SmoothedFit, loss
         1 - loss.ratio(null.end, end, fit, screened.band),
         certainty(candidate, effect, cov),
         reported.value / reported.std if reported and reported.std > 0 else np.inf,
-        foreseen,
+        share,
         end,
     )
 

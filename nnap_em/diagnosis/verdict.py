@@ -122,6 +122,13 @@ def even(values: Sequence[float]) -> list[int]:
     return [i for i, value in enumerate(values) if value >= EQUIVALENT * max(values)]
 
 
+def lead(own: float, its: float) -> float:
+    """Distance by which a law in the place of another explains more than that, in units of that within which both
+    explain the same: beyond one it is clearly better, below minus one clearly worse.
+    """
+    return (its - own) / max((1 - EQUIVALENT) * max(own, its), 1e-12)
+
+
 def simplest(values: Sequence[float], complexities: Sequence[int], ties: Sequence[float]) -> int:
     """The one order of laws: place of the simplest of those that explain as much as the best, then by `ties`."""
     return min(even(values), key=lambda i: (complexities[i], -ties[i]))
@@ -181,6 +188,14 @@ def veto(
 def needed(share: float, floor: float) -> bool:
     """True for a share between two fits, with an effect and without it, that is enough for the effect."""
     return share >= KEEP * floor
+
+
+def foreseen(share: float, floor: float, complexity: int, *, hidden: bool) -> bool:
+    """True where the step of the screen removes a share of the squared error that makes a refit worth its time.
+
+    A motion that is `hidden` was inferred without the law, and need not follow it.
+    """
+    return hidden or needed(share, FORESEEN * required(floor, complexity))
 
 
 def suspected(share: float, floor: float, chance: float) -> bool:

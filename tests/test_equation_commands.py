@@ -1,7 +1,6 @@
 """Commands on a rig that is written as equations: each works, or refuses with one sentence and writes nothing."""
 
 import ctypes
-import dataclasses
 import json
 import shutil
 import subprocess
@@ -14,7 +13,6 @@ import numpy as np
 import pytest
 from helpers import chain_rig, csv_text
 
-import nnap_em
 from nnap_em.commands.cli import main
 from nnap_em.data.logs import read_logs
 from nnap_em.data.rig import read_rig
@@ -133,18 +131,6 @@ def test_fits_of_other_equations_are_not_compared(place, monkeypatch, capsys):
     save(place / "other" / "model.npz", _fit(other)[0])
     assert main(["compare", "monday", "other"]) == 2
     assert "the equations of monday and other differ; compare fits of one machine" in capsys.readouterr().err
-
-
-def test_a_simulation_of_a_fit_is_that_of_its_transition(place):
-    model = dataclasses.replace(nnap_em.load(place / "monday" / "model.npz").model, substeps=10)
-    still = eqx.tree_at(lambda m: (m.log_q, m.log_r), model, (jnp.full(2, -60.0), jnp.full(1, -60.0)))
-    u = jnp.linspace(0.0, 1.0, 12)[None, :, None]
-    logs = nnap_em.simulate(still, jnp.asarray([[0.5, 0.2]]), u, key=jax.random.key(0))
-    x = jnp.asarray([0.5, 0.2])
-    for k in range(12):
-        np.testing.assert_allclose(logs.x[0, k], x, atol=1e-6)
-        np.testing.assert_allclose(logs.data.y[0, k, 0], x[1] + 0.1 * u[0, k, 0], atol=1e-6)
-        x = model.transition(x, Inputs.held(u[0, k]))
 
 
 def test_the_numbers_of_equations_are_exported_with_their_units(place, tmp_path):

@@ -27,6 +27,12 @@ DATA = Dataset(*(np.zeros((4, 9, *shape)) for shape in ((), (1,), (2,))), np.one
 PATH = Gaussian(jnp.zeros((4, 9, 2)), jnp.zeros((4, 9, 2, 2)))
 
 
+def _fake(monkeypatch, module, **values) -> None:
+    """Stand-ins of some names of a module."""
+    for name, value in values.items():
+        monkeypatch.setattr(module, name, value)
+
+
 def _heavy(mass: float):
     return eqx.tree_at(lambda m: m.system.m, MODEL, jnp.asarray(mass))
 
@@ -80,25 +86,24 @@ class _Along(NamedTuple):
         return np.array({1.0: self.best, 1.5: self.tried}[_mass(model)] + np.array([0.0, 2.0, np.nan]))
 
 
-@pytest.mark.parametrize(
-    ("best", "tried", "used", "ess", "taken"),
-    [
-        (-40.0, 1.0, [1, 1, 0], np.inf, True),  # rises by 41, known to 40
-        (40.0, 81.0, [1, 1, 0], np.inf, True),
-        (-40.0, -1.0, [1, 1, 0], np.inf, False),
-        (40.0, 79.0, [1, 1, 0], np.inf, False),
-        (-40.0, 1.0, [1, 0, 0], np.inf, False),  # a sequence is lost
-        (-40.0, 1.0, [1, 1, 0], 100.0, False),  # of samples it would be chance
-    ],
-)
-def test_a_fall_along_its_own_path_is_judged_along_the_path_of_the_step(best, tried, used, ess, taken):
+PATHS = [  # likelihoods of the best and of the tried along one path, use, effective sample size, whether it is taken
+    (-40.0, 1.0, [1, 1, 0], np.inf, True),  # rises by 41, known to 40
+    (40.0, 81.0, [1, 1, 0], np.inf, True),
+    (-40.0, -1.0, [1, 1, 0], np.inf, False),
+    (40.0, 79.0, [1, 1, 0], np.inf, False),
+    (-40.0, 1.0, [1, 0, 0], np.inf, False),  # a sequence is lost
+    (-40.0, 1.0, [1, 1, 0], 100.0, False),  # of samples it would be chance
+]
+
+
+def test_a_fall_along_its_own_path_is_judged_along_the_path_of_the_step():
     """Likelihoods along different paths differ by what is known of neither."""
-    state, used = _state([0.0, 2.0, np.nan], ess=ess), np.array(used) > 0
-    same = lambda: loop._rise(state, PATH, DATA, _Along(best, tried), used)  # noqa: E731
-    after = loop._judge(state, _heavy(2.5), jnp.ones((1, 1)), np.array([-9.0, -7.0, -9.0]), used, same)
-    assert _mass(after.best) == (1.5 if taken else 1.0)
-    assert after.top[0] == (-9.0 if taken else 0.0)
-    assert after.stride == pytest.approx(0.6 if taken else 0.2)
+    for best, tried, mask, ess, taken in PATHS:
+        state, used = _state([0.0, 2.0, np.nan], ess=ess), np.array(mask) > 0
+        same = lambda: loop._rise(state, PATH, DATA, _Along(best, tried), used)  # noqa: B023, E731
+        after = loop._judge(state, _heavy(2.5), jnp.ones((1, 1)), np.array([-9.0, -7.0, -9.0]), used, same)
+        assert (_mass(after.best), after.top[0]) == ((1.5, -9.0) if taken else (1.0, 0.0))
+        assert after.stride == pytest.approx(0.6 if taken else 0.2)
 
 
 def test_a_fall_is_judged_once_more_with_all_rows_in_sight_only(monkeypatch):
@@ -110,8 +115,7 @@ def test_a_fall_is_judged_once_more_with_all_rows_in_sight_only(monkeypatch):
         info, fall = MStepInfo(jnp.ones((1, 1)), np.ones(4, bool)), -10.0 * len(horizons) * np.ones(4)
         return model, info, fall, np.full(4, np.inf), PATH
 
-    monkeypatch.setattr(loop, "em_step", em_step)
-    monkeypatch.setattr(loop, "_rise", lambda *_: judged.append(horizons[-1]) or 1.0)
+    _fake(monkeypatch, loop, em_step=em_step, _rise=lambda *_: judged.append(horizons[-1]) or 1.0)
     state = _state(np.full(4, -np.inf), epoch=1)
     loop.fit(state, DATA, CubatureSmoother(StartBank((1, 1))), RULE, epochs=6, schedule=Schedule(first=4, growth=3.0))
     assert horizons == [4, 4, 9, 9, 9] and judged == [9, 9]
@@ -143,43 +147,43 @@ def test_a_horizon_is_held_and_grows():
     assert [Schedule().horizon(epoch, 200) for epoch in range(9)] == [60, 60, 60, 96, 96, 154, 154, 200, 200]
 
 
-@pytest.mark.parametrize(
-    ("changes", "rests"),
-    [
-        ({"loglik": np.array([5.0, 5.04, 5.0])}, True),
-        ({"loglik": np.array([5.0, 5.06, 5.06])}, False),  # still moved an epoch ago
-        ({"epoch": 2, "loglik": np.array([5.0, 5.0])}, False),
-        ({"loglik": np.array([5.0, 4.0, 5.0]), "stride": 0.1}, True),
-        ({"loglik": np.array([5.0, 4.0, 5.0]), "stride": 0.1, "ess": 100.0}, False),  # by chance, of a sample
-    ],
-)
-def test_em_rests_where_nothing_moves(changes, rests):
-    reason = loop._ended(_state([0.0], **changes), Schedule(first=9), 9, 0.05)
-    assert reason == ("" if not rests else loop.STEP_REFUSED if "stride" in changes else loop.RESTED)
-    assert not loop._ended(_state([0.0], **changes), Schedule(first=4, hold=1), 9, 0.05)  # not yet the whole
+RESTS = [
+    ({"loglik": np.array([5.0, 5.04, 5.0])}, True),
+    ({"loglik": np.array([5.0, 5.06, 5.06])}, False),  # still moved an epoch ago
+    ({"epoch": 2, "loglik": np.array([5.0, 5.0])}, False),
+    ({"loglik": np.array([5.0, 4.0, 5.0]), "stride": 0.1}, True),
+    ({"loglik": np.array([5.0, 4.0, 5.0]), "stride": 0.1, "ess": 100.0}, False),  # by chance, of a sample
+]
+
+
+def test_em_rests_where_nothing_moves():
+    for changes, rests in RESTS:
+        reason = loop._ended(_state([0.0], **changes), Schedule(first=9), 9, 0.05)
+        assert reason == ("" if not rests else loop.STEP_REFUSED if "stride" in changes else loop.RESTED)
+        assert not loop._ended(_state([0.0], **changes), Schedule(first=4, hold=1), 9, 0.05)  # not yet the whole
 
 
 WHOLE = [0.0, 90.0, 6.0, 6.0]
 
 
-@pytest.mark.parametrize(
-    ("loglik", "changes", "rise"),
-    [
-        ([*WHOLE, 6.04, 6.08], {}, 0.0),
-        ([*WHOLE, 6.04, 6.11], {}, 0.11),
-        ([*WHOLE, 6.5, 6.2], {}, 0.5),  # the last step was tried, and refused
-        ([*WHOLE, -90.0, 5.0], {}, 0.0),
-        ([*WHOLE, 5.0, 6.9], {"ess": 100.0}, 0.0),  # by chance, of a sample
-        ([*WHOLE, 5.0, 7.1], {"ess": 100.0}, 1.1),
-        (WHOLE, {}, np.inf),
-        (WHOLE[1:], {"epoch": 4}, np.inf),
-        ([*WHOLE[1:], 6.0], {"epoch": 5}, 0.0),  # begun from another fit, whose first epoch counts
-    ],
-)
-def test_a_fit_that_its_epochs_end_has_the_rise_of_its_likelihood(loglik, changes, rise):
+RISES = [
+    ([*WHOLE, 6.04, 6.08], {}, 0.0),
+    ([*WHOLE, 6.04, 6.11], {}, 0.11),
+    ([*WHOLE, 6.5, 6.2], {}, 0.5),  # the last step was tried, and refused
+    ([*WHOLE, -90.0, 5.0], {}, 0.0),
+    ([*WHOLE, 5.0, 6.9], {"ess": 100.0}, 0.0),  # by chance, of a sample
+    ([*WHOLE, 5.0, 7.1], {"ess": 100.0}, 1.1),
+    (WHOLE, {}, np.inf),
+    (WHOLE[1:], {"epoch": 4}, np.inf),
+    ([*WHOLE[1:], 6.0], {"epoch": 5}, 0.0),  # begun from another fit, whose first epoch counts
+]
+
+
+def test_a_fit_that_its_epochs_end_has_the_rise_of_its_likelihood():
     """Two epochs see 4 of 9 samples; what they reached is no measure of the others, and two others are too few."""
-    state = _state([0.0], **{"epoch": len(loglik), "ess": np.inf, "loglik": np.array(loglik), **changes})
-    assert loop.unsettled(state, Schedule(first=4, growth=3.0, hold=1), 9) == pytest.approx(rise)
+    for loglik, changes, rise in RISES:
+        state = _state([0.0], **{"epoch": len(loglik), "ess": np.inf, "loglik": np.array(loglik), **changes})
+        assert loop.unsettled(state, Schedule(first=4, growth=3.0, hold=1), 9) == pytest.approx(rise)
 
 
 def test_the_likeliest_process_noise_is_where_it_begins(monkeypatch):
@@ -189,8 +193,7 @@ def test_the_likeliest_process_noise_is_where_it_begins(monkeypatch):
         tried.append(float(model.log_q[0]))
         return SimpleNamespace(loglik=np.array([-abs(tried[-1] - 2 * np.log(0.1)), 1e3 * len(tried)]))
 
-    monkeypatch.setattr(loop, "_alone", e_step)
-    monkeypatch.setattr(loop, "not_diverged", lambda *_: np.array([True, False]))
+    _fake(monkeypatch, loop, _alone=e_step, not_diverged=lambda *_: np.array([True, False]))
     settled = loop._settle_noise(MODEL, DATA, None, jax.random.key(0))
     np.testing.assert_allclose(tried, 2 * np.log([1.0, 0.3, 0.1, 0.03, 0.01]))
     np.testing.assert_allclose(settled.log_q, 2 * np.log(0.1))
@@ -212,8 +215,7 @@ def test_a_refit_goes_back_a_third_of_the_way_and_keeps_the_best(monkeypatch):
         strides.append(float(rule.max_log_step))
         return core._replace(log_q=core.log_q + 3.0), jnp.asarray(tried[-1]), None
 
-    monkeypatch.setattr(refits, "locals_along", lambda *_: SimpleNamespace(filtered_from=None))
-    monkeypatch.setattr(refits, "each", smoothed)
+    _fake(monkeypatch, refits, locals_along=lambda *_: SimpleNamespace(filtered_from=None), each=smoothed)
     monkeypatch.setattr(ScoringMStep, "advance", advance)
     trial = refits.refit(MODEL, RULE, PATH, DATA, np.array([True, True, False]), passes=5)
     # 3 is worse than 0: a third of it; from 1 on with twice the share, and a third of that
@@ -243,10 +245,9 @@ def test_a_gauss_newton_step(monkeypatch, size, end):
         return np.broadcast_to(scale[:, None], (4, 3, len(horizons), 1))
 
     one = np.ones((4, 3, 2, 1, RULE.weights(MODEL).nodes.size + 1))
-    monkeypatch.setattr(multistep, "followed", _followed)
-    monkeypatch.setattr(multistep, "open_loop", lambda along, *_: OpenLoop(errors(along, (0, 0)), one, np.ones(2)))
-    monkeypatch.setattr(multistep, "errors", errors)
-    monkeypatch.setattr(multistep, "_goal", lambda weights, unknown, start, *_: start + 1.0)
+    prediction = lambda along, *_: OpenLoop(errors(along, (0, 0)), one, np.ones(2))  # noqa: E731
+    goal = lambda weights, unknown, start, *_: start + 1.0  # noqa: E731
+    _fake(monkeypatch, multistep, followed=_followed, open_loop=prediction, errors=errors, _goal=goal)
     done = multistep.finish(RULE.prior.write(MODEL, jnp.zeros(1)), RULE, PATH, DATA, np.ones(4, bool)).model
     assert float(RULE.prior.read(done)[0]) == pytest.approx(end)
 
@@ -255,11 +256,10 @@ def test_a_gauss_newton_step(monkeypatch, size, end):
 def test_a_shaped_finish_adds_the_prior_of_friction_and_nothing_to_parameters(monkeypatch, shaped):
     nodes, asked = RULE.weights(MODEL).nodes.size, []
     prediction = OpenLoop(np.ones((4, 3, 2, 1)), np.ones((4, 3, 2, 1, nodes + 1)), np.ones(2))
-    fakes = {"followed": _followed, "open_loop": lambda *_: prediction, "errors": lambda *_: prediction.error}
-    fakes["friction_prior"] = lambda *_: (np.full((nodes + 1,) * 2, 7.0), np.full(nodes + 1, 3.0))
-    fakes["_goal"] = lambda *arguments: asked.append(arguments[-2:]) or arguments[2]
-    for name, value in fakes.items():
-        monkeypatch.setattr(multistep, name, value)
+    prior = np.full((nodes + 1,) * 2, 7.0), np.full(nodes + 1, 3.0)
+    goal = lambda *arguments: asked.append(arguments[-2:]) or arguments[2]  # noqa: E731
+    given = {"open_loop": lambda *_: prediction, "errors": lambda *_: prediction.error, "_goal": goal}
+    _fake(monkeypatch, multistep, followed=_followed, friction_prior=lambda *_: prior, **given)
     multistep.finish(MODEL, RULE, PATH, DATA, np.ones(4, bool), shaped=shaped)
     ((score, information),) = asked
     weight = multistep.weighed(prediction, np.ones(4, bool)).sum()
@@ -280,10 +280,8 @@ def test_recordings_that_disagree_and_forces_unsaid_widen_a_posterior_but_not_it
     pushed = np.broadcast_to([1.0, 0.0, 2.0], (*errors.shape, 3))
     prediction = OpenLoop(errors, np.concatenate([columns, pushed], axis=-1), np.ones(2))
     every, likelihood = np.ones(4, bool), 50
-    monkeypatch.setattr(stated, "discrepancy_columns", lambda *_, **__: None)
-    monkeypatch.setattr(stated, "followed", lambda *_: None)
-    monkeypatch.setattr(stated, "open_loop", lambda *_: prediction)
-    monkeypatch.setattr(stated, "size", lambda *_: force)
+    given = {"discrepancy_columns": lambda *_, **__: None, "open_loop": lambda *_: prediction}
+    _fake(monkeypatch, stated, followed=lambda *_: None, size=lambda *_: force, **given)
     hessian = RULE.weights(MODEL).prior_precision(MODEL.unknown).at[-1, -1].add(likelihood)
     precision, size = stated.widened(MODEL, RULE, PATH, DATA, every, hessian, key=jax.random.key(0))
     assert size == force
@@ -296,15 +294,14 @@ def test_recordings_that_disagree_and_forces_unsaid_widen_a_posterior_but_not_it
     assert 1.0 <= float(precision[-1, -1]) <= 1.0 + likelihood + 1e-9
 
 
-@pytest.mark.parametrize(("rows", "blocks"), [(24, 3), (7, 1)])
-def test_a_single_recording_counts_as_blocks_longer_than_its_errors_correlate(rows, blocks):
+def test_a_single_recording_counts_as_blocks_longer_than_its_errors_correlate():
     """Horizons of one and two starts, so that a block has eight of them; no score is lost."""
-    scores = np.random.default_rng(0).normal(size=(1, rows, 2))
-    cut = stated.clustered(scores, np.array([1.0, 2.0]))
-    assert cut.shape == (blocks, 2)
-    np.testing.assert_allclose(cut, [part.sum(axis=0) for part in np.array_split(scores[0], blocks)])
-    both = np.concatenate([scores, scores])
-    np.testing.assert_allclose(stated.clustered(both, np.array([1.0, 2.0])), both.sum(axis=1))
+    for rows, blocks in ((24, 3), (7, 1)):
+        scores, horizons = np.random.default_rng(0).normal(size=(1, rows, 2)), np.array([1.0, 2.0])
+        cut = [part.sum(axis=0) for part in np.array_split(scores[0], blocks)]
+        np.testing.assert_allclose(stated.clustered(scores, horizons), cut)
+        both = np.concatenate([scores, scores])
+        np.testing.assert_allclose(stated.clustered(both, horizons), both.sum(axis=1))
 
 
 @pytest.mark.parametrize("tau", [0.0, 0.03, 0.3])
@@ -370,8 +367,7 @@ def test_a_finish(monkeypatch, inside, outside, white):
     fakes |= {"followed": _followed, "ahead": lambda *_: ()}
     fakes["e_step"] = lambda model, *_, **__: SimpleNamespace(state=PATH, loglik=np.full(4, _mass(model)))
     fakes["widened"] = lambda *args, key: stated.Stated(2 * args[-1], 0.7)
-    for name, value in fakes.items():
-        monkeypatch.setattr(identify, name, value)
+    _fake(monkeypatch, identify, **fakes)
     rule, smoother = _CurvatureRule(RULE.prior), SimpleNamespace(tolerant=lambda: None)
     fitted = Identified(None, _state([0.0])._replace(hessian=jnp.ones((1, 1))), rule, None, smoother)
     after = identify.finished(fitted, DATA)

@@ -704,7 +704,7 @@ a fit that predicts worse is kept
 + a, near)
 the worst of two fits is kept
 - if share <= min(left) + LEAST_FALL
-+ if share >= min(left) + LEAST_FALL
++ if share <= max(left) + LEAST_FALL
 ## test_search.py::test_one_fit_is_ahead_of_another_by_what_it_is_likelier_less_a_sixth_at_either_end
 trimmed sum not rescaled
 - cut : gain.size - cut]) * gain.size)

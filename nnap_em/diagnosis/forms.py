@@ -86,7 +86,7 @@ def forms(view: View) -> list[Form]:
     within = view.start + view.span * np.linspace(0.0, 1.0, 41)
     around = np.linspace(0, 1, 41) if view.whole else within  # with both ends: what is polished stays in its grid
     widths = np.log(np.geomspace(0.3 * view.fine, max(0.25 * view.span, view.fine), 8))
-    inner, none = within[4:-4], np.zeros((1, 0))
+    inner = within[4:-4]
     zones = product(inner[::2], inner[::2])
     zones = zones[zones[:, 1] - zones[:, 0] > 0.09 * view.span]
 
@@ -95,25 +95,19 @@ def forms(view: View) -> list[Form]:
     rates = np.arange(1.0, finest + 0.5) if view.whole else part
     rotary = view.across == "rad" and not view.whole and view.span * view.length > 0.6 * np.pi  # as gravity
     once = np.full((int(rotary), 1), view.length / (2 * np.pi))
-    low, high = product(rates, rates).T
-    enough = (low * view.span > 1.8) | (view.whole & (high > 2.9))  # once and twice a turn: any smooth curve
-    pairs = np.stack([low, high - low], axis=1)[enough & ((high - low) * view.span > 0.89)]
     cycles = product(rates[rates <= 0.8 * finest], np.linspace(0, 1, 17), [0.2, 0.35, 0.5, 0.65, 0.8])
 
     waves = [
         Form(_ripples, _ripple, once, (), 3),
         Form(_ripples, _ripple, rates[:, None], () if view.whole else (0,), 3),
         Form(_cycles, _square_wave, cycles, (1, 2) if view.whole else (0, 1, 2), 4),
-        Form(_ripples, _two_ripples, pairs, () if view.whole else (0, 1), 6),
     ]
     bump = Form(_bells, _bump, product(around, widths), (0, 1), 3)
     local = [
-        Form(_powers(1), _line, none, (), 1),
-        Form(_powers(2), _polynomial, none, (), 2),
+        Form(_lines, _line, np.zeros((1, 0)), (), 1),
         Form(_hinges, _hinge, product(inner, [-1.0, 1.0]), (0,), 2),
         Form(_steps, _step, product(within[2:-2], widths), (0, 1), 3),
         bump,
-        Form(_powers(3), _polynomial, none, (), 3),
         Form(_zones, _zone, zones, (0, 1), 3),
         Form(_bends, _bend, inner[:, None], (0,), 3),
     ]
@@ -128,21 +122,13 @@ def product(*axes: np.ndarray | list[float]) -> Places:
 # --- at one place
 
 
-def _powers(order: int) -> Callable[[View, Places], Columns]:
-    return lambda view, place: np.stack([view.z**k for k in range(1, order + 1)], axis=1)[None]
+def _lines(view: View, place: Places) -> Columns:
+    return view.z[None, :, None]
 
 
 def _line(view: View, place: Place, size: Size) -> Description:
     slope = view.slope(size[0])
     return Description("line", {"slope": slope}, f"nearly a straight line in {view.name}, slope {slope}")
-
-
-def _polynomial(view: View, place: Place, size: Size) -> Description:
-    kind, powers = "parabola" if size.size == 2 else "cubic", np.arange(1, size.size + 1)
-    ends = view.start + view.span * np.linspace(0, 1, 3)
-    first, middle, last = (view.slope(size @ (powers * z ** (powers - 1))) for z in ends)
-    words = f"a {kind} in {view.name}, slopes {first:.3g}, {middle:.3g} and {last} from end to end"
-    return Description(kind, {"slope_first": first, "slope_middle": middle, "slope_last": last}, words)
 
 
 def _hinges(view: View, place: Places) -> Columns:
@@ -188,11 +174,8 @@ def _step(view: View, place: Place, size: Size) -> Description:
     at, over = view.at(place[0]), view.wide(1.5 * view.fine if sharp else wide)
     way, tall = "up" if size[0] > 0 else "down", view.force(abs(size[0]))
     numbers = {"place": at, "height": view.force(size[0]), "transition": over}
-    if wide < view.span / 3 or sharp:
-        blur = f" (or a transition no wider than {over})" if sharp else f", over {over}"
-        return Description("step", numbers, f"a step {way} at {view.name} = {at}, {tall} high{blur}")
-    words = f"a slope in {view.name} about {at} that levels off on both sides, {tall} {way} over {over}"
-    return Description("saturation", numbers, words)
+    blur = f" (or a transition no wider than {over})" if sharp else f", over {over}"
+    return Description("step", numbers, f"a step {way} at {view.name} = {at}, {tall} high{blur}")
 
 
 def _bells(view: View, place: Places) -> Columns:
@@ -214,9 +197,8 @@ def _bump(view: View, place: Place, size: Size) -> Description:
 
 
 def _ripples(view: View, place: Places) -> Columns:
-    waves = np.cumsum(place, axis=1)[:, None, :]
-    phase, both = 2 * np.pi * waves * view.z[:, None], waves < 0.49 / view.fine  # two nodes a period: one phase is seen
-    return np.concatenate([np.cos(phase), both * np.sin(phase)], axis=2)
+    phase, both = 2 * np.pi * place * view.z, place < 0.49 / view.fine  # two nodes a period: one phase is seen
+    return np.stack([np.cos(phase), both * np.sin(phase)], axis=2)
 
 
 def _rate(view: View, wave: float) -> tuple[str, Quantity, str]:
@@ -236,31 +218,16 @@ def _of(view: View, text: str) -> str:
     return f"{text} Hz" if view.across == "s" else f"period {text} {view.across}"
 
 
-def _wave(view: View, wave: float, cos: float, sin: float) -> tuple[Quantity, Quantity, str]:
+def _ripple(view: View, place: Place, size: Size) -> Description:
     """Amplitude and phase of amplitude sin(k x + phase); "at least", where basis and prior make it too small."""
+    (wave,), (cos, sin) = place, size
+    key, rate, text = _rate(view, wave)
     phase = np.arctan2(cos, sin) - 2 * np.pi * wave * view.low / view.length
     turned = Quantity(float((phase + np.pi) % (2 * np.pi) - np.pi), "rad")
-    return view.force(np.hypot(cos, sin)), turned, "at least " if wave > 0.4 / view.fine else ""
-
-
-def _ripple(view: View, place: Place, size: Size) -> Description:
-    key, rate, text = _rate(view, place[0])
-    amplitude, phase, least = _wave(view, place[0], *size)
-    unseen = ", overtones not seen" if 3 * place[0] > 0.48 / view.fine else ""
+    amplitude, least = view.force(np.hypot(cos, sin)), "at least " if wave > 0.4 / view.fine else ""
+    unseen = ", overtones not seen" if 3 * wave > 0.48 / view.fine else ""
     words = f"a ripple in {view.name} of {_of(view, text)}, amplitude {least}{amplitude}{unseen}"
-    return Description("ripple", {key: rate, "amplitude": amplitude, "phase": phase}, words)
-
-
-def _two_ripples(view: View, place: Place, size: Size) -> Description:
-    numbers, texts, tall = {}, [], []
-    for i, wave in enumerate(np.cumsum(place)):
-        key, rate, text = _rate(view, wave)
-        amplitude, phase, least = _wave(view, wave, size[i], size[i + 2])
-        numbers |= {f"{key}_{i + 1}": rate, f"amplitude_{i + 1}": amplitude, f"phase_{i + 1}": phase}
-        texts, tall = [*texts, text], [*tall, f"{least}{amplitude:.3g}"]
-    often = _of(view, " and ".join(texts))
-    words = f"two ripples in {view.name} of {often}, amplitudes {' and '.join(tall)} {view.unit}"
-    return Description("two ripples", numbers, words)
+    return Description("ripple", {key: rate, "amplitude": amplitude, "phase": turned}, words)
 
 
 def _cycles(view: View, place: Places) -> Columns:

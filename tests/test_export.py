@@ -1,6 +1,5 @@
 """A model that left the house: the same numbers."""
 
-import functools
 import json
 
 import equinox as eqx
@@ -13,9 +12,7 @@ from nnap_em.commands import cli
 from nnap_em.data.dataset import Dataset
 from nnap_em.data.rig import Declared, Rig
 from nnap_em.effects import catalogue
-from nnap_em.export import unroll
-from nnap_em.export.model import ExportError, parameters, write_model
-from nnap_em.export.online import write_observer
+from nnap_em.export.model import parameters, write_model
 from nnap_em.fit.identify import Identified, begin, friction_table, parameter_table
 from nnap_em.fit.store import save
 
@@ -31,8 +28,8 @@ EFFECTS = (
 )
 
 
-@functools.cache
-def _fitted() -> Identified:
+@pytest.fixture(scope="module")
+def fitted() -> Identified:
     """A pendulum with numbers that no fit made, with a spring and a biased sensor."""
     t, rng = DT * np.arange(ROWS), np.random.default_rng(0)
     y, u = 0.8 * np.sin(5 * t) + 1e-3 * rng.normal(size=ROWS), 0.3 * np.sin(4 * t)
@@ -44,8 +41,7 @@ def _fitted() -> Identified:
     return fitted._replace(state=fitted.state._replace(model=model, best=model, hessian=hessian))
 
 
-def test_the_json_has_the_numbers_of_the_model(tmp_path):
-    fitted = _fitted()
+def test_the_json_has_the_numbers_of_the_model(fitted, tmp_path):
     write_model(fitted, tmp_path)
     content = json.loads((tmp_path / "parameters.json").read_text(), parse_constant=pytest.fail)
     value, std = parameter_table(fitted)["m"]
@@ -55,6 +51,7 @@ def test_the_json_has_the_numbers_of_the_model(tmp_path):
     assert content["dt"] == {"value": DT, "unit": "s"}
     assert [effect["name"] for effect in content["effects"]] == [effect.name for effect in fitted.model.effects]
     (joint,) = content["friction"]["joints"]
+    assert (joint["velocity_unit"], joint["torque_unit"]) == ("rad/s", "N m")
     velocity = jnp.asarray([joint["velocity"]])
     np.testing.assert_allclose(joint["torque"], friction_table(fitted, velocity).torque[0], rtol=1e-12)
     network = content["friction"]["network"]  # by hand, from the JSON alone
@@ -67,37 +64,19 @@ def test_the_json_has_the_numbers_of_the_model(tmp_path):
     assert torque == pytest.approx(float(fitted.model.unknown(jnp.asarray([v]))[0]), rel=1e-12)
 
 
-def test_a_slide_is_exported_in_newtons_and_metres():
-    rig = Rig("s", "slide", {"m": Declared(1.0, 0.0)}, True, ("f",), (1,), DT, "sequence", ("x",), {"x": 1e-3}, {})
+def test_a_slide_is_exported_in_newtons_and_metres_and_without_friction():
+    rig = Rig("s", "slide", {"m": Declared(1.0, 0.0)}, False, ("f",), (1,), DT, "sequence", ("x",), {"x": 1e-3}, {})
     swing = np.sin(5 * DT * np.arange(ROWS))[None, :, None]
     data = Dataset(DT * np.arange(ROWS)[None], swing, swing, np.ones((1, ROWS), bool))
-    spring = catalogue["torsional_spring"](*map(jnp.asarray, (20.0, 1.0, 0.0, 0.0)), joint=1)
-    fitted = begin(rig, data, key=jax.random.key(0), effects=(spring,))
-    fitted = fitted._replace(state=fitted.state._replace(hessian=jnp.eye(fitted.state.hessian.shape[0])))
-    content = parameters(fitted)
-    (effect,), (joint,) = content["effects"], content["friction"]["joints"]
+    spring = catalogue["torsional_spring"].of(20.0, 1.0, 0.0, 0.0, joint=1)
+    content = parameters(begin(rig, data, key=jax.random.key(0), effects=(spring,)))
+    (effect,) = content["effects"]
     assert {n: p["unit"] for n, p in effect["parameters"].items()} == {"k": "N/m", "theta0": "m"}
-    assert (joint["velocity_unit"], joint["torque_unit"]) == ("m/s", "N")
-    assert content["inputs"] == [{"name": "f", "joint": 1, "unit": "N"}]
+    assert content["inputs"] == [{"name": "f", "joint": 1, "unit": "N"}] and content["friction"] is None
 
 
-def test_a_form_with_other_numbers_is_not_exported(monkeypatch, tmp_path):
-    monkeypatch.setitem(unroll._ELEMENTWISE, "tanh", "{}")
-    with pytest.raises(ExportError, match="the NumPy form of 'friction1_network' gives other numbers than JAX"):
-        write_observer(_fitted(), tmp_path / "arm.c")
-    assert not list(tmp_path.iterdir())
-
-
-def test_a_declared_frictionless_slide_is_exported_too():
-    t = DT * np.arange(ROWS)
-    rig = Rig("s", "slide", {"m": Declared(1.0, 0.0)}, False, (), (), DT, "sequence", ("x",), {"x": 1e-3}, {})
-    data = Dataset(t[None], np.zeros((1, ROWS, 0)), (0.5 * t)[None, :, None], np.ones((1, ROWS), bool))
-    fitted = begin(rig, data, key=jax.random.key(0))
-    assert parameters(fitted)["friction"] is None
-
-
-def test_the_command_writes_the_numbers(tmp_path, capsys):
-    save(tmp_path / "fit/model.npz", _fitted())
+def test_the_command_writes_the_numbers(fitted, tmp_path, capsys):
+    save(tmp_path / "fit/model.npz", fitted)
     assert cli.main(["export", str(tmp_path / "fit"), "--out", str(tmp_path / "out")]) == 0
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["parameters.json"]
     assert "wrote parameters.json to " in capsys.readouterr().err

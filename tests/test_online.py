@@ -1,7 +1,6 @@
 """The observer in C: compiled, and compared with the one in Python; wild input under sanitizers."""
 
 import dataclasses
-import subprocess
 
 import equinox as eqx
 import jax
@@ -14,7 +13,6 @@ from nnap_em.commands import cli
 from nnap_em.data.dataset import Dataset
 from nnap_em.data.rig import Declared, Rig
 from nnap_em.effects import catalogue
-from nnap_em.export import online
 from nnap_em.export.model import ExportError
 from nnap_em.export.online import numbers, table, write_observer
 from nnap_em.fit.identify import begin
@@ -61,7 +59,7 @@ def plain(fit, tmp_path_factory):
     """The fit, its observer in C, a log and the states of the observer in Python along it."""
     source = tmp_path_factory.mktemp("plain") / "arm.c"
     write_observer(fit, source)
-    return fit, source, _replayed(fit, *_log(2000))
+    return fit, source, _replayed(fit, *_log(1000))
 
 
 SPRING, LATE = (
@@ -72,8 +70,7 @@ LAG, LATE_SENSOR = catalogue["actuator_lag"].of(0.1, joint=1), catalogue["sensor
 SERVO = Servo("u", "position", {k: jnp.asarray(v) for k, v in dict(kp=1.0, kd=0.02, delay=0.05, limit=0.3).items()})
 LAWS = {
     "held: a servo with a delay, a late input, a lag, a spring": ((LATE, LAG, SPRING), (SERVO,), False),
-    "smooth: a servo with a delay, a lag": ((LAG,), (SERVO,), True),
-    "smooth: a late input, a late sensor": ((LATE, LATE_SENSOR), None, True),
+    "smooth: a servo with a delay, a lag, a late sensor": ((LATE_SENSOR, LAG), (SERVO,), True),
 }
 
 
@@ -82,21 +79,21 @@ def _replayed(fitted, t, u, y):
     return t, u, y, jax.tree.map(np.asarray, replay(observer(fitted), t, u, y))
 
 
-def _compare(source, replayed, atol, kind=np.float64):
+def _compare(source, replayed, atol, kind=np.float64, *options):
     *log, states = replayed
-    found = play(source, *log, states.mean.shape[1], kind)
+    found = play(source, *log, states.mean.shape[1], kind, *options)
     std = np.sqrt(np.diagonal(states.cov, axis1=1, axis2=2))
     assert np.max(np.abs(found.mean - states.mean) / std) < atol
     assert np.max(np.abs(found.cov - states.cov) / (std[:, :, None] * std[:, None])) < 10 * atol
     np.testing.assert_array_equal(found.flags, states.flags)
 
 
-def test_c_gives_the_numbers_of_python_over_2000_rows_with_gaps(plain):
+def test_c_gives_the_numbers_of_python_over_rows_with_gaps(plain):
     _, source, replayed = plain
     _compare(source, replayed, 1e-9)
     states = replayed[-1]
     assert np.any(states.flags & MISSING) and np.any(states.flags & OUTLIER)
-    assert np.ptp(states.mean[1000:, 0]) > 1.0
+    assert np.ptp(states.mean[500:, 0]) > 1.0
     assert "friction1_rows" in source.read_text()  # as a table, not as its network
 
 
@@ -107,14 +104,15 @@ def test_c_has_laws_of_command_and_sensor(fit, effects, servos, smooth, tmp_path
     _compare(tmp_path / "dressed.c", _replayed(fitted, *_log()), 1e-9)
 
 
-def test_float_is_within_a_hundredth_of_a_standard_deviation(plain, tmp_path):
+def test_the_command_writes_floats_within_a_hundredth_of_a_standard_deviation(plain, tmp_path, capsys):
     fitted, _, replayed = plain
-    write_observer(fitted, tmp_path / "arm.c", single=True)
-    _compare(tmp_path / "arm.c", replayed, 0.01, np.float32)
-    code = (tmp_path / "arm.c").read_text()
-    for doubles in ("double time", "whole(double x)"):
-        code = code.replace(doubles, "")
+    save(tmp_path / "fit/model.npz", fitted._replace(discrepancy=0.0))
+    assert cli.main(["export", str(tmp_path / "fit"), "--observer", str(tmp_path / "arm.c"), "--float"]) == 0
+    assert {path.name for path in tmp_path.iterdir()} == {"fit", "arm.c", "arm.h"}
+    assert "typedef float arm_real;" in (tmp_path / "arm.h").read_text() and "wrote " in capsys.readouterr().err
+    code = (tmp_path / "arm.c").read_text().replace("double time", "")
     assert "sqrtf" in code and "double" not in code
+    _compare(tmp_path / "arm.c", replayed, 0.01, np.float32, "-Wdouble-promotion")
 
 
 @pytest.fixture(scope="module")
@@ -155,15 +153,11 @@ def test_a_table_is_as_exact_as_it_says():
     assert table(lambda v: jnp.sign(v - 0.1), "f", 2.0, 0.01, 1e-11) is None
 
 
-def test_nothing_is_written_where_a_law_has_no_c_form(fit, tmp_path, monkeypatch):
-    def refused(*args, **names):
-        raise ExportError("no form")
-
+def test_nothing_is_written_where_a_law_has_no_c_form(fit, tmp_path):
     with pytest.raises(ExportError, match="a file that ends in"):
         write_observer(fit, tmp_path / "arm.h")
-    monkeypatch.setattr(online, "unrolled", refused)
-    with pytest.raises(ExportError):
-        write_observer(fit, tmp_path / "arm.c")
+    with pytest.raises(ExportError, match="'erf' has no plain C form"):
+        write_observer(_with(fit, fit.model, unknown=jax.scipy.special.erf), tmp_path / "arm.c")
     assert not list(tmp_path.iterdir())
 
 
@@ -172,14 +166,3 @@ def test_numbers_that_a_program_may_change(fit):
     own = numbers(fit)
     assert own.names == ("m", "noise.theta1", "noise.dtheta1", "kick.theta1", "kick.dtheta1")
     assert own.values[:2] == pytest.approx((0.5, 0.01))
-
-
-def test_the_command_writes_c(fit, tmp_path, capsys):
-    save(tmp_path / "fit/model.npz", fit._replace(discrepancy=0.0))
-    words = ["export", str(tmp_path / "fit"), "--observer", str(tmp_path / "arm.c")]
-    assert cli.main([*words, "--float"]) == 0
-    assert {path.name for path in tmp_path.iterdir()} == {"fit", "arm.c", "arm.h"}
-    assert "typedef float arm_real;" in (tmp_path / "arm.h").read_text()
-    assert "wrote " in capsys.readouterr().err
-    strict = ["gcc", "-std=c99", "-pedantic", "-Wall", "-Wextra", "-Werror", "-Wdouble-promotion", "-c", "arm.c"]
-    subprocess.run(strict, cwd=tmp_path, check=True)

@@ -1,4 +1,7 @@
-"""JAX functions written out as NumPy: the same numbers for every system and effect, or refused by name."""
+"""JAX functions written out as C: compiled, the same numbers for every system and effect; or refused by name."""
+
+import ctypes
+import subprocess
 
 import jax
 import jax.numpy as jnp
@@ -6,62 +9,20 @@ import numpy as np
 import plant
 import pytest
 from helpers import around, declared_model
-from jaxtyping import Array, Float
 
 from nnap_em.effects import catalogue
-from nnap_em.export.unroll import UnrollError, unroll
+from nnap_em.export.c99 import WHOLE, Dialect, function
+from nnap_em.export.model import ExportError
+from nnap_em.export.unroll import unroll, unrolled
 from nnap_em.model.friction import FrictionNetwork
 from nnap_em.model.state_space import Inputs, with_effects
 from nnap_em.numerics.elementary import cos, sin
 
 MODEL = declared_model(plant.Case(steps=20, hidden=False))
-AROUND = around(MODEL)
-CANDIDATES = {name: laws[0].probes[0] for name, kind in catalogue.items() if (laws := kind.candidates(AROUND))}
-
-
-def _agrees(function, **arguments: Float[Array, "..."]) -> str:
-    """The source gives JAX's numbers, for one state and for a batch."""
-    source = unroll("function", function, **arguments)
-    space: dict = {"np": np}
-    exec(str(source), space)
-    wanted = function(*arguments.values())
-    for batch in ((), (3, 2)):
-        flat = [tuple(np.broadcast_to(a, batch) for a in np.ravel(value)) for value in arguments.values()]
-        outputs = space["function"](*flat)
-        for mine, his in zip((outputs,) if len(wanted) == 1 else outputs, wanted, strict=True):
-            parts = np.array([np.broadcast_to(np.asarray(a, float), batch) for a in mine])
-            np.testing.assert_allclose(np.moveaxis(parts, 0, -1), np.broadcast_to(np.ravel(his), (*batch, len(mine))))
-    return str(source)
-
-
-@pytest.mark.parametrize("name", [name for name in CANDIDATES if name != "sensor_delay"])
-def test_every_effect_of_the_catalogue(name):
-    model = with_effects(MODEL, (CANDIDATES[name],))
-    x = jnp.asarray(np.random.default_rng(0).normal(scale=3.0, size=model.log_q.shape[0]))
-    inputs = Inputs(jnp.asarray([0.2]), jnp.asarray([0.1]), jnp.asarray(1.0), jnp.asarray(1.0))
-    row = {name: value for name, value in inputs._asdict().items() if value is not None}
-
-    def rate(x, force, *row):
-        return (model.rate(x, Inputs(*row), force),)
-
-    def reading(x, *row):
-        return model.emission(x, Inputs(*row)), jax.jacfwd(model.emission)(x, Inputs(*row))
-
-    _agrees(rate, x=x, force=jnp.asarray([0.1, 0.2]), **row)
-    _agrees(reading, x=x, **row)
-
-
-def test_the_network_is_short():
-    """Two joints with 16 units: three lines a unit and a few more, not one for each of 88 weights."""
-    network = FrictionNetwork(jnp.ones(2), jnp.ones(2), key=jax.random.key(0))
-    assert _agrees(lambda v: (network(v),), v=jnp.asarray([0.3, -2.0])).count("\n") < 150
-
-
-def test_what_derivatives_leave_behind_is_gone():
-    """d (a x + b) / dx is a number."""
-    source = unroll("slope", lambda x: (jax.jacfwd(lambda x: 2.0 * x + 1.0)(x),), x=jnp.ones(2))
-    assert source.lines == ()
-    assert source.results == (("2.0", "0.0", "0.0", "2.0"),)
+CANDIDATES = {name: laws[0].probes[0] for name, kind in catalogue.items() if (laws := kind.candidates(around(MODEL)))}
+STRICT = ["gcc", "-std=c99", "-pedantic", "-Wall", "-Wextra", "-Werror"]
+X = jnp.asarray([0.3, 0.5, 0.7])
+NETWORK = FrictionNetwork(jnp.ones(2), jnp.ones(2), key=jax.random.key(0))
 
 
 CASES = {
@@ -90,14 +51,74 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("function", CASES.values(), ids=CASES)
-def test_what_jax_has(function):
-    _agrees(function, x=jnp.asarray([0.3, 0.5, 0.7]))
+def _of_effect(effect):
+    """Rate, reading and its slopes of the arm with an effect, of a state."""
+    model = with_effects(MODEL, (effect,))
+    row = Inputs(jnp.asarray([0.2]), jnp.asarray([0.1]), jnp.asarray(1.0), jnp.asarray(1.0))
+
+    def values(x, u):
+        inputs = row._replace(u=u)
+        emission = lambda x: model.emission(x, inputs)  # noqa: E731
+        return model.rate(x, inputs, jnp.asarray([0.1, 0.2])), emission(x), jax.jacfwd(emission)(x)
+
+    x = np.random.default_rng(0).normal(scale=3.0, size=model.log_q.shape[0])
+    return values, {"x": jnp.asarray(x), "u": jnp.asarray([0.2])}
+
+
+FUNCTIONS = {name: _of_effect(law) for name, law in CANDIDATES.items() if name != "sensor_delay"} | {
+    "network": (lambda v: (NETWORK(v),), {"v": jnp.asarray([0.3, -2.0])}),
+    **{name: (case, {"x": X}) for name, case in CASES.items()},
+}
+
+
+@pytest.fixture(scope="module")
+def numbers(tmp_path_factory):
+    """Results of all functions in C, which is one library, and in JAX, which is one program."""
+    folder = tmp_path_factory.mktemp("c")
+    sources = {name: unroll(f"f{i}", f, **arguments) for i, (name, (f, arguments)) in enumerate(FUNCTIONS.items())}
+    for file, dialect in (("f.c", Dialect()), ("single.c", Dialect("float", single=True))):
+        texts = WHOLE.replace("double", dialect.real), *(function(source, dialect) for source in sources.values())
+        (folder / file).write_text("\n".join(["#include <math.h>", *texts]))
+    subprocess.run([*STRICT, "-shared", "-fPIC", "f.c", "-o", "f.so", "-lm"], cwd=folder, check=True)
+    subprocess.run([*STRICT, "-Wdouble-promotion", "-fsyntax-only", "single.c"], cwd=folder, check=True)
+    library = ctypes.CDLL(str(folder / "f.so"))
+    truths = jax.jit(lambda given: {name: f(**given[name]) for name, (f, _) in FUNCTIONS.items()})
+    wanted, results = truths({name: arguments for name, (_, arguments) in FUNCTIONS.items()}), {}
+    for name, source in sources.items():
+        inputs = [np.ravel(np.asarray(a, float)) for a in FUNCTIONS[name][1].values()]
+        out = np.zeros(len(source.results))
+        getattr(library, source.name)(*(a.ctypes.data_as(ctypes.c_void_p) for a in (*inputs, out)))
+        results[name] = out, np.concatenate([np.ravel(a) for a in wanted[name]])
+    return results
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_compiled_c_has_the_numbers_of_jax(name, numbers):
+    np.testing.assert_allclose(*numbers[name], rtol=1e-7)
+
+
+def test_the_network_is_short():
+    """Two joints with 16 units: three lines a unit and a few more, not one for each of 88 weights."""
+    assert function(unroll("f", *FUNCTIONS["network"][:1], **FUNCTIONS["network"][1])).count("\n") < 150
+
+
+def test_what_derivatives_leave_behind_is_gone():
+    """d (a x + b) / dx is a number."""
+    source = unroll("slope", lambda x: (jax.jacfwd(lambda x: 2.0 * x + 1.0)(x),), x=jnp.ones(2))
+    assert source.lines == () and source.results == (2.0, 0.0, 0.0, 2.0)
+
+
+def test_a_form_with_other_numbers_is_refused(monkeypatch):
+    """Numbers of a form that are not those of JAX, wherever they come from."""
+    tanh = lambda x: (jnp.tanh(x),)  # noqa: E731
+    unrolled("f", tanh, x=X)
+    with pytest.raises(ExportError, match="'f' in scalars gives other numbers than JAX"):
+        unrolled("f", tanh, lambda x: (1.001 * jnp.tanh(x),), x=X)
 
 
 REFUSED = {
-    "erf": (lambda x: (jax.scipy.special.erf(x),), "'erf' has no plain NumPy form"),
-    "sort": (lambda x: (jnp.sort(x),), "'sort' has no plain NumPy form"),
+    "erf": (lambda x: (jax.scipy.special.erf(x),), "'erf' has no plain C form"),
+    "sort": (lambda x: (jnp.sort(x),), "'sort' has no plain C form"),
     "a loop of unknown length": (lambda x: (jax.lax.while_loop(lambda y: y[0] < 9, lambda y: 2 * y, x),), "'while'"),
     "a long loop": (lambda x: (jax.lax.fori_loop(0, 9999, lambda i, y: y * x, x),), "a loop of 9999 passes"),
     "whole numbers divided": (lambda x: (jax.lax.div((9 * x).astype(int), 2).astype(float),), "of whole numbers"),
@@ -111,11 +132,11 @@ REFUSED = {
         "'select_n' of more than two cases",
     ),
     "a half away from zero": (lambda x: (jax.lax.round(x),), "'round' away from zero"),
-    "steered": (lambda x: (jax.lax.dynamic_slice(x, (jnp.argmax(x),), (1,)),), "has no plain NumPy form|other numbers"),
+    "steered": (lambda x: (jax.lax.dynamic_slice(x, (jnp.argmax(x),), (1,)),), "has no plain C form|other numbers"),
 }
 
 
 @pytest.mark.parametrize("function, reason", REFUSED.values(), ids=REFUSED)
-def test_what_numpy_has_not_is_refused_by_name(function, reason):
-    with pytest.raises(UnrollError, match=reason):
+def test_what_c_has_not_is_refused_by_name(function, reason):
+    with pytest.raises(ExportError, match=reason):
         unroll("function", function, x=jnp.asarray([0.3, 0.5, 0.7]))

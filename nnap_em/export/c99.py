@@ -1,10 +1,10 @@
 """Friction and feed-forward torque, or equations, of a fitted model as C99, with the mathematics library alone."""
 
-import ast
+import math
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 
@@ -15,30 +15,13 @@ from ..fit.identify import Identified
 from ..model import hooks
 from ..model.state_space import Inputs
 from ..storage.files import replace_own
-from .model import ExportError, described, inputs_of, states_of, unrolled
+from .model import described, inputs_of, states_of
 from .placement import of_command
-from .unroll import Source
+from .unroll import Line, Source, unrolled
 
-CALLS: dict[str, str] = {
-    "maximum": "({0} > {1} ? {0} : {1})", "minimum": "({0} < {1} ? {0} : {1})", "where": "({} ? {} : {})",
-    "arctan2": "atan2({}, {})", "fmod": "fmod({}, {})", "abs": "fabs({})", "sign": "(({0} > 0) - ({0} < 0))",
-    "isfinite": "isfinite({})", "logical_not": "!({})", "arcsinh": "asinh({})", "arccosh": "acosh({})",
-    "arctanh": "atanh({})", "arcsin": "asin({})", "arccos": "acos({})", "arctan": "atan({})", "round": "rint({})",
-} | {name: f"{name}({{}})" for name in (
-    "sin", "cos", "tan", "sinh", "cosh", "tanh", "exp", "exp2", "expm1", "log", "log1p", "sqrt", "cbrt", "floor",
-    "ceil", "trunc",
-)}  # fmt: skip
-"""C of NumPy's functions."""
 WHOLE = """/* The whole number that a floating one is; 0 where none is. */
 static inline int whole(double x) { return (int)(x > -2000000000 && x < 2000000000 ? x : 0); }
 """
-OPERATORS: dict[type, str] = {
-    ast.Add: "({} + {})", ast.Sub: "({} - {})", ast.Mult: "({} * {})", ast.Div: "({} / {})", ast.Pow: "pow({}, {})",
-    ast.BitAnd: "({} & {})", ast.BitOr: "({} | {})", ast.BitXor: "({} ^ {})", ast.USub: "(-{})",
-    ast.Eq: "({} == {})", ast.NotEq: "({} != {})", ast.Lt: "({} < {})", ast.LtE: "({} <= {})",
-    ast.Gt: "({} > {})", ast.GtE: "({} >= {})",
-}  # fmt: skip
-"""C of Python's operators."""
 
 
 def torques(fitted: Identified) -> tuple[Callable, Callable, tuple[AbstractEffect, ...]]:
@@ -150,12 +133,17 @@ class Dialect(NamedTuple):
 
     def number(self, value: float) -> str:
         """A literal."""
-        return repr(value) + ("f" if self.single else "")
+        text = repr(value) + ("f" if self.single else "")
+        return "NAN" if value != value else text if math.isfinite(value) else text.partition("inf")[0] + "INFINITY"
 
-    def call(self, form: str, arguments: list[str]) -> str:
-        """A function of the mathematics library."""
-        single = self.single and not form.startswith("isfinite")
-        return (re.sub(r"^([a-z]+[0-9p]*)\(", r"\1f(", form) if single else form).format(*arguments)
+    def scalar(self, value: Any) -> str:
+        """A name, or a number between brackets where it has a sign."""
+        text = value if isinstance(value, str) else self.number(value) if type(value) is float else f"{int(value)}"
+        return f"({text})" if text.startswith("-") else text
+
+    def of(self, line: Line) -> str:
+        """The expression of a line."""
+        return line.op.c.replace("~", "f" if self.single else "").format(*map(self.scalar, line.values))
 
 
 PLAIN = Dialect()
@@ -166,79 +154,26 @@ def function(source: Source, dialect: Dialect = PLAIN, out: str = "tau", points:
 
     With `points` of them the first argument and the result have an axis more; curves are read before the loop over it.
     """
-    results, real = [text for result in source.results for text in result], dialect.real
+    real, first = dialect.real, next(iter(source.sizes), "")
     along, at, own = (f"[{points}]", "[l]", "restrict ") if points else ("", "", "")
-    loop, inside, first = f"for (int l = 0; l < {points}; l++)", [], next(iter(source.sizes), "")
-    axes = {name: f"[{size or 1}]{along if name == first else ''}" for name, size in source.sizes.items()}
-    arrays = ", ".join(f"const {real} {name}{axis}" for name, axis in axes.items())
-    lines = [f"{dialect.words} {source.name}({arrays}, {real} {out}[{own}{len(results) or 1}]{along})", "{"]
-    code = "\n".join((*source.lines, *results))
-    for name, size in source.sizes.items():
-        lines += [f"    (void){name};"]
-        used = (i for i in range(size) if re.search(rf"\b{name}{i}\b", code))
-        inside += [f"    const {real} {name}{i} = {name}[{i}]{at if name == first else ''};" for i in used]
-    whole_numbers: set[str] = set()
+    axes = {name: along if name == first else "" for name in source.sizes}
+    places = {
+        f"{name}{i}": f"{name}[{i}]{at if axes[name] else ''}" for name, n in source.sizes.items() for i in range(n)
+    }
+    arrays = ", ".join(f"const {real} {name}[{size or 1}]{axes[name]}" for name, size in source.sizes.items())
+    lines = [f"{dialect.words} {source.name}({arrays}, {real} {out}[{own}{len(source.results) or 1}]{along})", "{"]
+    lines += [f"    (void){name};" for name in source.sizes]
+    used = {value for line in source.lines for value in line.values} | {*source.results}
+    inside = [f"const {real} {name} = {place};" for name, place in places.items() if name in used]
+    loop = f"    for (int l = 0; l < {points}; l++)"
     for line in source.lines:
-        name, _, text = line.partition(" = ")
-        if points and (call := re.fullmatch(rf"(\w+)\({first}(\d+)\)", text)):
-            lines += [f"    {real} {name}s{along};", f"    {loop} {name}s{at} = {call[1]}({first}[{call[2]}]{at});"]
-            inside.append(f"    const {real} {name} = {name}s{at};")
-            continue
-        node = ast.parse(text, mode="eval").body
-        if _whole(node, whole_numbers):
-            whole_numbers.add(name)
-        inside.append(f"    const {'int' if name in whole_numbers else real} {name} = {_c(node, dialect)};")
-    final = (_c(ast.parse(text, mode="eval").body, dialect) for text in results)
-    inside += [f"    {out}[{i}]{at} = {text};" for i, text in enumerate(final)]
+        text = dialect.of(line)
+        if points and line.op.own and line.values[0] in places:
+            curve = line.op.c.format(places[line.values[0]])
+            lines += [f"    {real} {line.name}s{along};", f"{loop} {line.name}s{at} = {curve};"]
+            text = f"{line.name}s{at}"
+        inside.append(f"const {'int' if line.whole else real} {line.name} = {text};")
+    inside += [f"{out}[{i}]{at} = {dialect.scalar(value)};" for i, value in enumerate(source.results)]
     if points:
-        inside = [f"    {loop} {{", *(f"    {line}" for line in inside), "    }"]
-    return "\n".join([*lines, *inside, "}", ""])
-
-
-def _whole(node: ast.AST, names: set[str]) -> bool:
-    """True for an expression of whole numbers or truth values; `names` are the variables that hold them."""
-    match node:
-        case ast.Constant(value=value):
-            return isinstance(value, int)
-        case ast.Name(id=name):
-            return name in names
-        case ast.Compare() | ast.Call(func=ast.Attribute(attr="astype" | "logical_not" | "isfinite")):
-            return True
-        case ast.BinOp(left=left, op=op, right=right):
-            return not isinstance(op, ast.Div | ast.Pow) and _whole(left, names) and _whole(right, names)
-        case ast.UnaryOp(operand=operand):
-            return _whole(operand, names)
-        case ast.Call(func=ast.Attribute(attr="where"), args=[_, first, second]):
-            return _whole(first, names) and _whole(second, names)
-    return False
-
-
-def _c(node: ast.AST, dialect: Dialect) -> str:
-    """A Python expression of scalars in C.
-
-    Raises ExportError for what has no plain C form.
-    """
-    match node:
-        case ast.Constant(value=bool() | int() as value):
-            return str(int(value))
-        case ast.Constant(value=float() as value):
-            return dialect.number(value)
-        case ast.Name(id=name):
-            return name
-        case ast.Attribute(value=ast.Name(id="np"), attr="inf" | "nan" as name):
-            return {"inf": "INFINITY", "nan": "NAN"}[name]
-        case ast.BinOp(left=ast.Name(id=name), op=ast.Pow(), right=ast.Constant(value=int(power))) if 1 < power < 5:
-            return f"({' * '.join([name] * power)})"
-        case ast.BinOp(left=left, op=op, right=right) if type(op) in OPERATORS:
-            return OPERATORS[type(op)].format(_c(left, dialect), _c(right, dialect))
-        case ast.UnaryOp(op=op, operand=operand) if type(op) in OPERATORS:
-            return OPERATORS[type(op)].format(_c(operand, dialect))
-        case ast.Compare(left=left, ops=[op], comparators=[right]) if type(op) in OPERATORS:
-            return OPERATORS[type(op)].format(_c(left, dialect), _c(right, dialect))
-        case ast.Call(func=ast.Attribute(value=ast.Name(id="np"), attr=name), args=args) if name in CALLS:
-            return dialect.call(CALLS[name], [_c(a, dialect) for a in args])
-        case ast.Call(func=ast.Name(id=name), args=args):
-            return f"{name}({', '.join(_c(a, dialect) for a in args)})"
-        case ast.Call(func=ast.Attribute(value=inner, attr="astype")):
-            return f"whole({_c(inner, dialect)})".replace("(trunc(", "((").replace("(truncf(", "((")
-    raise ExportError(f"{ast.unparse(node)!r} has no plain C form")
+        inside = [f"{loop.strip()} {{", *(f"    {line}" for line in inside), "}"]
+    return "\n".join([*lines, *(f"    {line}" for line in inside), "}", ""])

@@ -1,14 +1,11 @@
-"""A fitted model for other programs: its numbers as JSON, and functions of it in plain NumPy."""
+"""A fitted model for other programs: its numbers as JSON."""
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, cast
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
 
 from .. import __version__
 from ..effects import AbstractEffect
@@ -18,7 +15,6 @@ from ..model.state_space import StateSpaceModel
 from ..report.tables import json_text
 from ..storage.files import replace_own
 from ..systems import AbstractPlant
-from .unroll import Source, UnrollError, unroll
 
 
 class ExportError(ValueError):
@@ -76,38 +72,6 @@ def parameters(fitted: Identified) -> dict[str, Any]:
         "friction": _friction(fitted) if rig.friction else None,
         "effects": [_effect(effect, system) for effect in model.effects],
     }
-
-
-def unrolled(
-    name: str,
-    function: Callable[..., tuple[Array, ...]],
-    truth: Callable[..., tuple[Array, ...]] | None = None,
-    names: dict[str, Any] | None = None,
-    **arguments: Array,
-) -> Source:
-    """`function` in NumPy, compared with JAX at four random places about `arguments`.
-
-    The numbers of JAX are those of `truth`, where the function has others by their `names` in it.
-    Raises ExportError where there is no such source, or where its numbers are others.
-    """
-    try:
-        source = unroll(name, function, **arguments)
-    except UnrollError as error:
-        raise ExportError(str(error)) from None
-    rng, space = np.random.default_rng(0), {"np": np, **(names or {})}
-    centres = [np.asarray(a) for a in arguments.values()]
-    places = [np.where(a == 0, 3.0, 0.1 * a) * rng.normal(size=(4, *a.shape)) + a for a in centres]
-    expected = jax.jit(jax.vmap(truth or function))(*(jnp.asarray(a, jnp.result_type(float)) for a in places))
-    exec(str(source), space)  # what the exported program does
-    with np.errstate(all="ignore"):
-        outputs = cast(Callable, space[name])(*(tuple(a.reshape(4, -1).T) for a in places))
-    for mine, theirs in zip((outputs,) if len(expected) == 1 else outputs, expected, strict=True):
-        flat = np.asarray(theirs, np.float64).reshape(4, -1)
-        computed = np.stack([np.broadcast_to(a, 4) for a in mine], axis=1) if mine else flat
-        bound = math.sqrt(jnp.finfo(theirs.dtype).eps)
-        if not np.allclose(computed, flat, rtol=bound, atol=bound, equal_nan=True):
-            raise ExportError(f"the NumPy form of {name!r} gives other numbers than JAX")
-    return source
 
 
 def inputs_of(fitted: Identified) -> dict[str, str]:

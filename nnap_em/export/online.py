@@ -23,8 +23,8 @@ from ..model.state_space import Inputs, StateSpaceModel
 from ..smoother.mixture import WIDE_STD
 from ..storage.files import replace_own
 from .c99 import WHOLE, Dialect, function, identifier
-from .model import ExportError, states_of, unrolled
-from .unroll import named
+from .model import ExportError, states_of
+from .unroll import named, unrolled
 
 DEGREE = 7
 """Degree of the polynomials of a friction table."""
@@ -191,11 +191,10 @@ def _functions(model: StateSpaceModel, prior: ParameterPrior, dialect: Dialect) 
 
     size = prior.size + len(model.measured) + model.log_q.shape[0]
     row, p = jnp.zeros(2 * drives + 2 + scales), jnp.concatenate([prior.read(model), jnp.ones(size - prior.size)])
-    spaces = {found.name: found for found in tables.values()}
     x = jnp.asarray(model.start.mean)
     true = lambda x, row, p: rate(x, row, p, network)  # noqa: E731
     sources = [
-        unrolled("rate", rate, true, spaces, x=x, row=row, p=p),
+        unrolled("rate", rate, true, x=x, row=row, p=p),
         unrolled("reading", reading, x=x, row=row, p=p),
         unrolled("commands", commands, memory=flat, u=jnp.zeros(drives + scales), first=jnp.ones(1), p=p),
     ]

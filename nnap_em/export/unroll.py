@@ -1,10 +1,12 @@
-"""A small JAX function as plain NumPy source: every array unrolled to scalars, which may then be batches of any shape.
+"""A small JAX function as operations on scalars, one a line: every array is unrolled.
 
 What only moves numbers about (slices, reshapes, gathers) leaves no line: JAX does it on the numbers' places.
 """
 
+import functools
 import itertools
 import math
+import operator
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -13,273 +15,348 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend import core
 
-_ELEMENTWISE = {  # primitive to NumPy
-    "add": "{} + {}", "add_any": "{} + {}", "sub": "{} - {}", "mul": "{} * {}", "div": "{} / {}", "neg": "-{}",
-    "max": "np.maximum({}, {})", "min": "np.minimum({}, {})", "pow": "{} ** {}", "atan2": "np.arctan2({}, {})",
-    "rem": "np.fmod({}, {})", "square": "{0} * {0}", "rsqrt": "1.0 / np.sqrt({})", "abs": "np.abs({})",
-    "logistic": "1.0 / (1.0 + np.exp(-{}))", "clamp": "np.minimum(np.maximum({1}, {0}), {2})", "sign": "np.sign({})",
-    "select_n": "np.where({0}, {2}, {1})", "is_finite": "np.isfinite({})", "not": "np.logical_not({})",
-    "and": "{} & {}", "or": "{} | {}", "xor": "{} ^ {}",
-    "eq": "{} == {}", "ne": "{} != {}", "lt": "{} < {}", "le": "{} <= {}", "gt": "{} > {}", "ge": "{} >= {}",
-    "asinh": "np.arcsinh({})", "acosh": "np.arccosh({})", "atanh": "np.arctanh({})", "asin": "np.arcsin({})",
-    "acos": "np.arccos({})", "atan": "np.arctan({})", "round": "np.round({})",
-} | {name: f"np.{name}({{}})" for name in (
-    "sin", "cos", "tan", "sinh", "cosh", "tanh", "exp", "exp2", "expm1", "log", "log1p", "sqrt", "cbrt", "floor", "ceil"
+from .model import ExportError
+
+
+class Op(NamedTuple):
+    """An operation: its form in C, where ~ ends the name of a function of the mathematics library, and its numbers."""
+
+    c: str
+    value: Callable[..., Any]
+    own: bool = False
+    """True for a function that is written beside the lines."""
+
+
+_OPS = {name: Op(*pair) for name, pair in {
+    "add": ("{} + {}", np.add), "sub": ("{} - {}", np.subtract), "mul": ("{} * {}", np.multiply),
+    "div": ("{} / {}", np.divide), "neg": ("-{}", np.negative), "pow": ("pow~({}, {})", np.power),
+    "max": ("{0} > {1} ? {0} : {1}", np.maximum), "min": ("{0} < {1} ? {0} : {1}", np.minimum),
+    "atan2": ("atan2~({}, {})", np.arctan2), "rem": ("fmod~({}, {})", np.fmod), "square": ("{0} * {0}", np.square),
+    "rsqrt": ("1 / sqrt~({})", lambda x: 1 / np.sqrt(x)), "abs": ("fabs~({})", np.abs),
+    "logistic": ("1 / (1 + exp~(-{}))", lambda x: 1 / (1 + np.exp(-x))), "round": ("rint~({})", np.round),
+    "sign": ("({0} > 0) - ({0} < 0)", np.sign), "is_finite": ("isfinite({}) != 0", np.isfinite),
+    "select_n": ("{0} ? {2} : {1}", lambda which, other, one: np.where(which, one, other)),
+    "not": ("!{}", np.logical_not), "and": ("{} & {}", np.bitwise_and), "or": ("{} | {}", np.bitwise_or),
+    "xor": ("{} ^ {}", np.bitwise_xor), "eq": ("{} == {}", np.equal), "ne": ("{} != {}", np.not_equal),
+    "lt": ("{} < {}", np.less), "le": ("{} <= {}", np.less_equal), "gt": ("{} > {}", np.greater),
+    "ge": ("{} >= {}", np.greater_equal), "real": ("{}", lambda x: x * 1.0),
+    "whole": ("whole({})", lambda x: np.trunc(x).astype(int)),
+}.items()} | {name: Op(f"{name}~({{}})", getattr(np, name)) for name in (
+    "sin", "cos", "tan", "sinh", "cosh", "tanh", "exp", "exp2", "expm1", "log", "log1p", "sqrt", "cbrt", "floor",
+    "ceil", "asinh", "acosh", "atanh", "asin", "acos", "atan",
 )}  # fmt: skip
+_REDUCTIONS = {"reduce_sum": "add", "reduce_max": "max", "reduce_min": "min", "reduce_prod": "mul"}
 _STEERED = {"gather": (0,), "dynamic_slice": (0,), "dynamic_update_slice": (0, 1), "scatter": (0, 2)}
 """Operands that are moved, where others give the destination."""
-_MOVERS = (
-    *_STEERED, "broadcast_in_dim", "concatenate", "pad", "reshape", "rev", "slice", "split", "squeeze", "stack",
-    "transpose", "unstack",
-)  # fmt: skip
-_SCATTERED = {"scatter-add": ("{} + {}", 0.0), "scatter-mul": ("{} * {}", 1.0)}
-"""Their form, and the number that changes nothing."""
-
-
-class UnrollError(ValueError):
-    """An operation that cannot be written in plain NumPy, by the name of JAX's primitive."""
-
-
-_named = core.Primitive("named")
-_named.def_abstract_eval(lambda x, function, value: x)
-_named.def_impl(lambda x, function, value: jnp.asarray(value(np.asarray(x)), x.dtype))
+_MOVERS = (*_STEERED, "pad", "rev", "split", "transpose", "unstack")
+_NAMED = core.Primitive("named")
+_NAMED.def_abstract_eval(lambda x, function, value: x)
 
 
 def named(function: str, value: Callable[[np.ndarray], np.ndarray], x: jax.Array) -> jax.Array:
     """A function of a scalar that is written by its name; `value` has its numbers."""
-    return _named.bind(x, function=function, value=value)
+    return _NAMED.bind(x, function=function, value=value)
+
+
+class Line(NamedTuple):
+    """A scalar and the operation that gives it."""
+
+    name: str
+    op: Op
+    values: tuple[Any, ...]
+    """Names of scalars, and numbers."""
+    whole: bool
+    """True for a whole number or a truth value."""
 
 
 class Source(NamedTuple):
-    """A Python function of NumPy scalars or equal batches."""
+    """A function of scalars, line by line."""
 
     name: str
     sizes: dict[str, int]
-    """The number of scalars in each argument."""
-    lines: tuple[str, ...]
-    results: tuple[tuple[str, ...], ...]
-    """The expressions of each result, flat."""
+    """The number of scalars in each argument: those of q are q0, q1."""
+    lines: tuple[Line, ...]
+    results: tuple[Any, ...]
+    """Names and numbers, flat."""
 
-    def __str__(self) -> str:
-        results = ", ".join("(" + "".join(f"{x}, " for x in result) + ")" for result in self.results)
-        unpack = [f"{''.join(f'{name}{i}, ' for i in range(n))}= {name}" for name, n in self.sizes.items() if n]
-        body = "\n".join(f"    {line}" for line in [*unpack, *self.lines, f"return {results}"])
-        return f"def {self.name}({', '.join(self.sizes)}):\n{body}\n"
+    def __call__(self, *arguments: np.ndarray) -> np.ndarray:
+        """Results (batch, result) of arguments (batch, scalar)."""
+        known = {f"{name}{i}": a for name, b in zip(self.sizes, arguments, strict=True) for i, a in enumerate(b.T)}
+        number = lambda value: known[value] if isinstance(value, str) else value  # noqa: E731
+        with np.errstate(all="ignore"):
+            for line in self.lines:
+                known[line.name] = line.op.value(*map(number, line.values))
+        return np.stack([np.broadcast_to(number(x), len(arguments[0])) for x in self.results], axis=1)
+
+
+def unrolled(name: str, function: Callable, truth: Callable | None = None, **arguments: jax.Array) -> Source:
+    """`unroll`, compared with JAX at four random places about `arguments`.
+
+    The numbers of JAX are those of `truth`, where the function has others by their `named` ones.
+    Raises ExportError where there is no such source, or where its numbers are others.
+    """
+    source, rng = unroll(name, function, **arguments), np.random.default_rng(0)
+    centres = [np.asarray(a) for a in arguments.values()]
+    places = [np.where(a == 0, 3.0, 0.1 * a) * rng.normal(size=(4, *a.shape)) + a for a in centres]
+    results = jax.jit(jax.vmap(truth or function))(*(jnp.asarray(a, jnp.result_type(float)) for a in places))
+    expected = np.concatenate([np.asarray(a, np.float64).reshape(4, -1) for a in results], axis=1)
+    bound = math.sqrt(jnp.finfo(jnp.result_type(float)).eps)
+    computed = source(*(a.reshape(4, -1) for a in places)) if source.results else expected
+    if not np.allclose(computed, expected, rtol=bound, atol=bound, equal_nan=True):
+        raise ExportError(f"{name!r} in scalars gives other numbers than JAX")
+    return source
+
+
+def unroll(name: str, function: Callable[..., tuple[jax.Array, ...]], **arguments: jax.Array) -> Source:
+    """`function` of arrays of the shapes of `arguments`, as a function of their flat scalars.
+
+    Raises ExportError for what has no plain form.
+    """
+    writer, sizes = _Writer(), {key: np.size(value) for key, value in arguments.items()}
+    names = [
+        np.array([f"{key}{i}" for i in range(np.size(value))], object).reshape(np.shape(value))
+        for key, value in arguments.items()
+    ]
+    outputs = writer.run(jax.make_jaxpr(function)(*arguments.values()), names)
+    results = tuple(itertools.chain(*(output.ravel().tolist() for output in outputs)))
+    return Source(name, sizes, writer.needed(results), results)
 
 
 class _Writer:
     """Lines so far; the same expression is written once, and constants are computed at once."""
 
     def __init__(self) -> None:
-        self.lines: dict[str, tuple[str, tuple[Any, ...]]] = {}
-        self.known: dict[Any, str] = {}
+        self.lines: dict[Any, Line] = {}
 
-    def write(self, form: str, *values: Any) -> Any:
-        """A scalar of that form: a name, or a number where all `values` are numbers."""
-        if not any(isinstance(value, str) for value in values):
-            with np.errstate(all="ignore"):
-                # the forms are the constants above
-                number = eval(form.format(*map(_text, values)), {"np": np, "inf": np.inf, "nan": np.nan})
-            return number.item() if isinstance(number, np.ndarray) else number
-        if (plain := _simpler(form, values)) is not None:
-            return plain
-        key = (form, *((type(value), repr(value)) for value in values))  # NaN is not itself, its text is
-        if key not in self.known:
-            self.known[key] = name = f"t{len(self.lines)}"
-            self.lines[name] = (form.format(*map(_text, values)), values)
-        return self.known[key]
-
-    def needed(self, results: Sequence[Any]) -> tuple[str, ...]:
+    def needed(self, results: Sequence[Any]) -> tuple[Line, ...]:
         """The lines that the results hang on."""
-        alive = {value for value in results if isinstance(value, str)}
-        for name in reversed(self.lines):
-            if name in alive:
-                alive |= {value for value in self.lines[name][1] if isinstance(value, str)}
-        return tuple(f"{name} = {text}" for name, (text, _) in self.lines.items() if name in alive)
+        alive, kept = set(filter(_is_name, results)), []
+        for line in reversed(self.lines.values()):
+            if line.name in alive:
+                alive |= set(filter(_is_name, line.values))
+                kept.append(line)
+        return tuple(reversed(kept))
+
+    def write(self, op: Op, whole: bool, *values: Any) -> Any:
+        """The result of an operation: a name, or a number where all `values` are numbers."""
+        if not any(map(_is_name, values)):
+            with np.errstate(all="ignore"):
+                return np.asarray(op.value(*values)).item()
+        if (plain := _simpler(op, values)) is not None:
+            return plain
+        key = (op.c, *((type(value), repr(value)) for value in values))  # NaN is not itself, its text is
+        return self.lines.setdefault(key, Line(f"t{len(self.lines)}", op, values, whole)).name
+
+    def each(self, op: Op, whole: bool, *operands: np.ndarray) -> np.ndarray:
+        """An operation on arrays, entry by entry."""
+        return np.frompyfunc(lambda *values: self.write(op, whole, *values), len(operands), 1)(*operands)
+
+    def run(self, jaxpr: Any, arguments: Sequence[np.ndarray]) -> list[np.ndarray]:
+        """The results of a jaxpr on arrays of names and numbers."""
+        closed = isinstance(jaxpr, core.ClosedJaxpr)
+        jaxpr, consts = (jaxpr.jaxpr, jaxpr.consts) if closed else (jaxpr, ())
+        values = dict(zip(jaxpr.constvars, map(_array, consts), strict=True))
+        values |= dict(zip(jaxpr.invars, arguments, strict=True))
+        read = lambda atom: _array(atom.val) if isinstance(atom, core.Literal) else values[atom]  # noqa: E731
+        for equation in jaxpr.eqns:
+            outputs = [np.asarray(x, object) for x in self.equation(equation, [read(a) for a in equation.invars])]
+            values |= dict(zip(equation.outvars, outputs, strict=True))
+        return [read(atom) for atom in jaxpr.outvars]
+
+    def equation(self, equation: core.JaxprEqn, operands: list[np.ndarray]) -> Sequence[Any]:
+        """The results of one operation of JAX."""
+        name, params, whole = equation.primitive.name, equation.params, _kind(equation.outvars[0]) != "f"
+        if name == "scan":
+            return self.scan(params, operands)
+        if name == "cond":
+            return self.cond(equation, operands)
+        for inner in ("jaxpr", "call_jaxpr", "fun_jaxpr"):
+            if inner in params:
+                return self.run(params[inner], operands)
+        if not any(map(_symbolic, operands)):
+            return _by_jax(equation, operands)
+        _refuse(equation)
+        if name in ("copy", "copy_p", "stop_gradient", "optimization_barrier", "reduce_precision"):
+            return operands
+        if name == "convert_element_type":
+            return [self.converted(_kind(equation.invars[0]), params["new_dtype"].kind, operands[0])]
+        if name == "integer_pow":
+            return [self.power(operands[0], params["y"], whole)]
+        if name == "named":
+            return [self.each(Op(f"{params['function']}({{}})", params["value"], own=True), whole, *operands)]
+        if name == "clamp":
+            low, x, high = operands
+            return [self.each(_OPS["min"], whole, self.each(_OPS["max"], whole, x, low), high)]
+        if name == "dot_general":
+            return [self.dot(*operands, params["dimension_numbers"], whole)]
+        if name in ("scatter-add", "scatter-mul"):
+            return [self.scatter(equation, whole, *operands)]
+        if name in _REDUCTIONS:
+            return [self.reduced(_OPS[_REDUCTIONS[name]], whole, operands[0], params["axes"])]
+        op = _OPS.get(name.removesuffix("_any"))
+        return [self.each(op, whole, *operands)] if op else _moved(equation, operands)
+
+    def converted(self, old: str, new: str, operand: np.ndarray) -> np.ndarray:
+        """Numbers of another kind."""
+        if new == "b":
+            return self.each(_OPS["ne"], True, operand, 0)
+        op = {("f", "i"): "whole", ("i", "f"): "real", ("b", "f"): "real"}.get((old, new))
+        return self.each(_OPS[op], new != "f", operand) if op else operand
+
+    def power(self, x: np.ndarray, y: int, whole: bool) -> np.ndarray:
+        """A whole power, small ones by products."""
+        if 1 < y < 5:
+            return self.reduced(_OPS["mul"], whole, np.stack([x] * y), (0,))
+        return self.each(_OPS["pow"], whole, x, y)
+
+    def reduced(self, op: Op, whole: bool, operand: np.ndarray, axes: Sequence[int]) -> np.ndarray:
+        """Entries along axes joined by an operation."""
+        for axis in sorted(axes, reverse=True):
+            operand = functools.reduce(lambda a, b: self.each(op, whole, a, b), np.moveaxis(operand, axis, 0))
+        return operand
+
+    def dot(self, a: np.ndarray, b: np.ndarray, numbers: Any, whole: bool) -> np.ndarray:
+        """Each element as one line: a sum of products."""
+        (ca, cb), (ba, bb) = numbers
+        fa = [i for i in range(a.ndim) if i not in (*ca, *ba)]
+        fb = [i for i in range(b.ndim) if i not in (*cb, *bb)]
+        batch, rows, columns = ([x.shape[i] for i in axes] for x, axes in ((a, ba), (a, fa), (b, fb)))
+        left = np.transpose(a, (*ba, *fa, *ca)).reshape((*batch, math.prod(rows), -1))
+        right = np.transpose(b, (*bb, *fb, *cb)).reshape((*batch, math.prod(columns), -1))
+        out = np.zeros((*batch, math.prod(rows), math.prod(columns)), object)
+        for *at, i, j in np.ndindex(out.shape):
+            pairs = zip(left[(*at, i)], right[(*at, j)], strict=True)
+            factors = [x for pair in pairs if not any(map(_is_zero, pair)) for x in pair]
+            op = Op(" + ".join(["{} * {}"] * (len(factors) // 2)), lambda *x: sum(map(operator.mul, x[::2], x[1::2])))
+            out[(*at, i, j)] = self.write(op, whole, *factors) if factors else 0.0
+        return out.reshape((*batch, *rows, *columns))
+
+    def scatter(
+        self, equation: core.JaxprEqn, whole: bool, base: np.ndarray, where: np.ndarray, other: np.ndarray
+    ) -> np.ndarray:
+        """Numbers added or multiplied to an array, each at a place of its own."""
+        name = equation.primitive.name
+        neutral = float(name == "scatter-mul")
+        if _symbolic(where):
+            raise ExportError(f"JAX's {name!r} changes numbers where other numbers say")
+        places = neutral + 1 + jnp.arange(float(other.size)).reshape(other.shape)
+        scattered = equation.primitive.bind(
+            jnp.full(base.shape, neutral), _typed(where, equation.invars[1]), places, **equation.params
+        )
+        places = np.asarray(scattered - neutral, int)
+        if sorted(places[places > 0]) != list(range(1, other.size + 1)):
+            raise ExportError(f"JAX's {name!r} changes one number several times")
+        others = np.array([neutral, *other.ravel()], object)[places]
+        return self.each(_OPS[name.removeprefix("scatter-")], whole, base, others)
+
+    def cond(self, equation: core.JaxprEqn, operands: list[np.ndarray]) -> list[np.ndarray]:
+        """Every branch, and the results of the one that holds."""
+        branches, (which, *arguments) = equation.params["branches"], operands
+        if not _symbolic(which):
+            return self.run(branches[int(which.item())], arguments)
+        first, *others = (self.run(branch, arguments) for branch in branches)
+        for k, other in enumerate(others, 1):
+            held = self.each(_OPS["eq"], True, which, k)
+            results = zip(equation.outvars, first, other, strict=True)
+            first = [self.each(_OPS["select_n"], _kind(atom) != "f", held, a, b) for atom, a, b in results]
+        return first
+
+    def scan(self, params: dict[str, Any], operands: list[np.ndarray]) -> list[np.ndarray]:
+        """A loop of fixed length, pass by pass."""
+        if params["length"] > 1000:  # passes of a loop
+            raise ExportError(f"a loop of {params['length']} passes")
+        consts, last = params["num_consts"], params["num_consts"] + params["num_carry"]
+        fixed, carry, along = operands[:consts], operands[consts:last], operands[last:]
+        rows: list[list[np.ndarray]] = []
+        for k in range(params["length"])[:: -1 if params["reverse"] else 1]:
+            outputs = self.run(params["jaxpr"], [*fixed, *carry, *(np.asarray(x[k], object) for x in along)])
+            carry, row = outputs[: len(carry)], outputs[len(carry) :]
+            rows.append(row)
+        rows = rows[::-1] if params["reverse"] else rows
+        return [*carry, *(np.stack(column) for column in zip(*rows, strict=True))]
 
 
-def unroll(name: str, function: Callable[..., tuple[jax.Array, ...]], **arguments: jax.Array) -> Source:
-    """`function` of arrays of the shapes of `arguments`, as source of a function of their flat scalars.
-
-    Raises UnrollError for what NumPy has no plain form of.
-    """
-    closed = jax.make_jaxpr(function)(*arguments.values())
-    writer = _Writer()
-    names = [
-        np.array([f"{key}{i}" for i in range(np.size(value))], object).reshape(np.shape(value))
-        for key, value in arguments.items()
-    ]
-    results = [np.ravel(result) for result in _run(writer, *_opened(closed), names)]
-    lines = writer.needed(list(itertools.chain(*results)))
-    sizes = {key: np.size(value) for key, value in arguments.items()}
-    return Source(name, sizes, lines, tuple(tuple(map(_text, result)) for result in results))
+def _is_name(value: Any) -> bool:
+    return isinstance(value, str)
 
 
-def _text(value: Any) -> str:
-    if isinstance(value, str):
-        return value
-    value = value.item() if isinstance(value, np.generic) else value
-    text = {math.inf: "np.inf", -math.inf: "(-np.inf)"}.get(value) if isinstance(value, float) else None
-    text = text or ("np.nan" if value != value else repr(value))
-    return f"({text})" if text.startswith("-") else text
+def _is_zero(value: Any) -> bool:
+    return not _is_name(value) and value == 0
 
 
-def _simpler(form: str, values: tuple[Any, ...]) -> Any:
+def _simpler(op: Op, values: tuple[Any, ...]) -> Any:
     """x + 0, x * 1, x * 0 and their like; derivatives are full of them."""
     if len(values) != 2:
         return None
-    a, b = values
-    zero, one = [not isinstance(x, str) and x == 0 for x in values], [not isinstance(x, str) and x == 1 for x in values]
-    if form == "{} + {}" and any(zero):
-        return b if zero[0] else a
-    if form == "{} - {}" and zero[1]:
-        return a
-    if form == "{} * {}" and any(zero):
-        return 0.0
-    if form == "{} * {}" and any(one):
-        return b if one[0] else a
-    if form == "{} / {}" and (one[1] or zero[0]):
-        return a if one[1] else 0.0
-    return None
-
-
-def _opened(jaxpr: Any) -> tuple[core.Jaxpr, Sequence[Any]]:
-    """A jaxpr and its constants."""
-    return (jaxpr.jaxpr, jaxpr.consts) if isinstance(jaxpr, core.ClosedJaxpr) else (jaxpr, ())
-
-
-def _run(
-    writer: _Writer, jaxpr: core.Jaxpr, consts: Sequence[Any], arguments: Sequence[np.ndarray]
-) -> list[np.ndarray]:
-    """The results of a jaxpr on arrays of names and numbers."""
-    values = dict(zip(jaxpr.constvars, map(_array, consts), strict=True))
-    values |= dict(zip(jaxpr.invars, arguments, strict=True))
-
-    def read(atom: Any) -> np.ndarray:
-        return _array(atom.val) if isinstance(atom, core.Literal) else values[atom]
-
-    for equation in jaxpr.eqns:
-        outputs = _equation(writer, equation, [read(atom) for atom in equation.invars])
-        values |= dict(zip(equation.outvars, outputs, strict=True))
-    return [read(atom) for atom in jaxpr.outvars]
+    (a, b), zero, one = values, [*map(_is_zero, values)], [not _is_name(x) and x == 1 for x in values]
+    plain = {
+        "{} + {}": ((zero[0], b), (zero[1], a)),
+        "{} - {}": ((zero[1], a),),
+        "{} * {}": ((any(zero), 0.0), (one[0], b), (one[1], a)),
+        "{} / {}": ((one[1], a), (zero[0], 0.0)),
+    }
+    return next((value for holds, value in plain.get(op.c, ()) if holds), None)
 
 
 def _array(value: Any) -> np.ndarray:
     return np.asarray(value).astype(object)
 
 
-def _dtype(atom: Any) -> np.dtype:
-    return atom.aval.dtype
+def _kind(atom: Any) -> str:
+    return atom.aval.dtype.kind
+
+
+def _typed(value: np.ndarray, atom: Any) -> jax.Array:
+    """Numbers alone, of the type that JAX has for them."""
+    return jnp.asarray(value.tolist(), atom.aval.dtype).reshape(value.shape)
 
 
 def _symbolic(value: np.ndarray) -> bool:
-    return any(isinstance(x, str) for x in value.ravel())
+    return any(map(_is_name, value.ravel()))
 
 
-def _equation(writer: _Writer, equation: core.JaxprEqn, operands: list[np.ndarray]) -> list[np.ndarray]:
+def _refuse(equation: core.JaxprEqn) -> None:
+    """Raise ExportError for an operation of which C has not the same one."""
     name, params = equation.primitive.name, equation.params
-    calls = ("jaxpr", "call_jaxpr", "fun_jaxpr")
-    inner = next((params[key] for key in calls if key in params), None)
-    if name == "scan":
-        return _scan(writer, params, operands)
-    if name == "cond":
-        return _cond(writer, params["branches"], operands)
-    if inner is not None:
-        return _run(writer, *_opened(inner), operands)
-    if not any(map(_symbolic, operands)):
-        return _constant(equation, operands)
-    if refused := _refused(equation):
-        raise UnrollError(f"JAX's {name!r} {refused} has no plain NumPy form here")
-    identities = ("copy", "copy_p", "stop_gradient", "optimization_barrier", "reduce_precision")
-    if name in identities:
-        return operands
-    if name == "convert_element_type":
-        return [_each(writer, _converted(_dtype(equation.invars[0]).kind, params["new_dtype"].kind), operands)]
-    if name == "integer_pow":
-        return [_each(writer, f"{{}} ** {params['y']}", operands)]
-    if name == "named":
-        return [_each(writer, f"{params['function']}({{}})", operands)]
-    if name in _ELEMENTWISE:
-        return [_each(writer, _ELEMENTWISE[name], operands)]
-    reductions = {"reduce_sum": "add", "reduce_max": "max", "reduce_min": "min", "reduce_prod": "mul"}
-    if name in reductions:
-        return [_reduce(writer, _ELEMENTWISE[reductions[name]], operands[0], params["axes"])]
-    if name == "dot_general":
-        return [_dot(writer, operands[0], operands[1], params["dimension_numbers"])]
-    return [_scatter(writer, equation, operands)] if name in _SCATTERED else _move(equation, operands)
-
-
-def _refused(equation: core.JaxprEqn) -> str | None:
-    """Property of an operation that NumPy does not share."""
-    name, kinds = equation.primitive.name, {_dtype(atom).kind for atom in equation.invars}
-    if name in ("div", "rem", "not") and kinds & {"i", "u"}:
-        return "of whole numbers"
+    reason = ""
+    if name in ("div", "rem", "not") and any(_kind(atom) in "iu" for atom in equation.invars):
+        reason = "of whole numbers"
     if name == "select_n" and len(equation.invars) > 3:
-        return "of more than two cases"
-    if name == "round" and equation.params["rounding_method"] != jax.lax.RoundingMethod.TO_NEAREST_EVEN:
-        return "away from zero"
-    return None
+        reason = "of more than two cases"
+    if name == "round" and params["rounding_method"] != jax.lax.RoundingMethod.TO_NEAREST_EVEN:
+        reason = "away from zero"
+    if reason:
+        raise ExportError(f"JAX's {name!r} {reason} has no plain C form here")
 
 
-def _converted(old: str, new: str) -> str:
-    """The form of a conversion between kinds of numbers."""
-    if new == "f":
-        return "{} * 1.0"
-    if new == "i":
-        return "np.trunc({}).astype(int)" if old == "f" else "{} * 1"
-    return "{} != 0"
-
-
-def _constant(equation: core.JaxprEqn, operands: list[np.ndarray]) -> list[np.ndarray]:
+def _by_jax(equation: core.JaxprEqn, operands: list[np.ndarray]) -> list[np.ndarray]:
     """Numbers alone: JAX computes them."""
-    typed = [
-        jnp.asarray(x.tolist(), _dtype(atom)).reshape(x.shape)
-        for x, atom in zip(operands, equation.invars, strict=True)
-    ]
-    outputs = equation.primitive.bind(*typed, **equation.params)
+    outputs = equation.primitive.bind(*map(_typed, operands, equation.invars), **equation.params)
     return [_array(x) for x in (outputs if equation.primitive.multiple_results else [outputs])]
 
 
-def _each(writer: _Writer, form: str, operands: list[np.ndarray]) -> np.ndarray:
-    spread = np.broadcast_arrays(*operands)
-    out = np.empty(spread[0].shape, object)
-    for place in np.ndindex(out.shape):
-        out[place] = writer.write(form, *(x[place] for x in spread))
-    return out
-
-
-def _reduce(writer: _Writer, form: str, operand: np.ndarray, axes: Sequence[int]) -> np.ndarray:
-    for axis in sorted(axes, reverse=True):
-        slices = list(np.moveaxis(operand, axis, 0))
-        operand = slices[0]
-        for part in slices[1:]:
-            operand = _each(writer, form, [np.asarray(operand, object), np.asarray(part, object)])
-    return np.asarray(operand, object)
-
-
-def _dot(writer: _Writer, a: np.ndarray, b: np.ndarray, numbers: Any) -> np.ndarray:
-    """Each element as one line: a sum of products."""
-    (ca, cb), (ba, bb) = numbers
-    fa = [i for i in range(a.ndim) if i not in (*ca, *ba)]
-    fb = [i for i in range(b.ndim) if i not in (*cb, *bb)]
-    batch, rows, columns = ([x.shape[i] for i in axes] for x, axes in ((a, ba), (a, fa), (b, fb)))
-    left = np.transpose(a, (*ba, *fa, *ca)).reshape((*batch, math.prod(rows), -1))
-    right = np.transpose(b, (*bb, *fb, *cb)).reshape((*batch, math.prod(columns), -1))
-    out = np.empty((*batch, math.prod(rows), math.prod(columns)), object)
-    for *at, i, j in np.ndindex(out.shape):
-        pairs = list(zip(left[(*at, i)], right[(*at, j)], strict=True))
-        terms = [(x, y) for x, y in pairs if not any(not isinstance(v, str) and v == 0 for v in (x, y))]
-        out[(*at, i, j)] = (
-            writer.write(" + ".join(["{} * {}"] * len(terms)), *itertools.chain(*terms)) if terms else 0.0
-        )
-    return out.reshape((*batch, *rows, *columns))
-
-
-def _move(equation: core.JaxprEqn, operands: list[np.ndarray]) -> list[np.ndarray]:
-    """Operations that move numbers, done by JAX on their places."""
-    name = equation.primitive.name
+def _moved(equation: core.JaxprEqn, operands: list[np.ndarray]) -> list[np.ndarray]:
+    """Operations that move numbers: the commonest by NumPy, others by JAX on their places."""
+    name, params, shape, first = equation.primitive.name, equation.params, equation.outvars[0].aval.shape, operands[0]
+    if name in ("reshape", "squeeze"):
+        return [first.reshape(shape)]
+    if name == "broadcast_in_dim":
+        axes = params["broadcast_dimensions"]
+        return [np.broadcast_to(np.expand_dims(first, [i for i in range(len(shape)) if i not in axes]), shape)]
+    if name == "concatenate":
+        return [np.concatenate(operands, params["dimension"])]
+    if name == "stack":
+        return [np.stack(operands, params["axis"])]
+    if name == "slice":
+        return [
+            first[
+                tuple(
+                    map(slice, params["start_indices"], params["limit_indices"], params["strides"] or [1] * first.ndim)
+                )
+            ]
+        ]
     if name not in _MOVERS:
-        raise UnrollError(f"JAX's {name!r} has no plain NumPy form here")
+        raise ExportError(f"JAX's {name!r} has no plain C form here")
     moved = _STEERED.get(name, range(len(operands)))
     pool: list[Any] = []
     places = []
@@ -288,63 +365,9 @@ def _move(equation: core.JaxprEqn, operands: list[np.ndarray]) -> list[np.ndarra
             places.append(jnp.asarray(len(pool) + np.arange(float(operand.size)).reshape(operand.shape)))
             pool += operand.ravel().tolist()
         elif _symbolic(operand):
-            raise UnrollError(f"JAX's {name!r} moves numbers to where other numbers say")
+            raise ExportError(f"JAX's {name!r} moves numbers to where other numbers say")
         else:
-            places.append(jnp.asarray(operand.tolist(), _dtype(atom)).reshape(operand.shape))
+            places.append(_typed(operand, atom))
     indices = equation.primitive.bind(*places, **equation.params)
     values = np.array(pool, object)
-    return [
-        np.asarray(values[np.asarray(x, int)], object)
-        for x in (indices if equation.primitive.multiple_results else [indices])
-    ]
-
-
-def _scatter(writer: _Writer, equation: core.JaxprEqn, operands: list[np.ndarray]) -> np.ndarray:
-    """Numbers added or multiplied to an array, each at a place of its own."""
-    base, where, other = operands
-    form, neutral = _SCATTERED[equation.primitive.name]
-    if _symbolic(where):
-        raise UnrollError(f"JAX's {equation.primitive.name!r} changes numbers where other numbers say")
-    first = neutral + 1
-    count = jnp.arange(first, first + other.size).reshape(other.shape)
-    index = jnp.asarray(where.tolist(), _dtype(equation.invars[1]))
-    scattered = equation.primitive.bind(jnp.full(base.shape, neutral), index, count, **equation.params)
-    places = np.asarray(scattered - neutral, int)
-    if sorted(places[places > 0]) != list(range(1, other.size + 1)):
-        raise UnrollError(f"JAX's {equation.primitive.name!r} changes one number several times")
-    return _each(writer, form, [base, np.array([neutral, *other.ravel()], object)[places]])
-
-
-def _cond(writer: _Writer, branches: Sequence[core.ClosedJaxpr], operands: list[np.ndarray]) -> list[np.ndarray]:
-    """Every branch, and the results of the one that holds."""
-    which, *arguments = operands
-    if not _symbolic(which):
-        return _run(writer, *_opened(branches[int(which.item())]), arguments)
-    first, *others = (_run(writer, *_opened(branch), arguments) for branch in branches)
-    for k, other in enumerate(others, 1):
-        held = _each(writer, "{} == {}", [which, np.asarray(k, object)])
-        first = [
-            _each(writer, _ELEMENTWISE["select_n"], [np.broadcast_to(held, b.shape), a, b])
-            for a, b in zip(first, other, strict=True)
-        ]
-    return first
-
-
-def _scan(writer: _Writer, params: dict[str, Any], operands: list[np.ndarray]) -> list[np.ndarray]:
-    """A loop of fixed length, pass by pass."""
-    if params["length"] > 1000:  # passes of a loop
-        raise UnrollError(f"a loop of {params['length']} passes")
-    if "ft_in" in params:  # jax 0.11 and newer
-        fixed, carry, along = map(list, params["ft_in"].update(operands).unpack())
-    else:
-        consts, last = params["num_consts"], params["num_consts"] + params["num_carry"]
-        fixed, carry, along = operands[:consts], operands[consts:last], operands[last:]
-    carried = len(carry)
-    rows: list[list[np.ndarray]] = []
-    order = range(params["length"])
-    for k in reversed(order) if params["reverse"] else order:
-        outputs = _run(writer, *_opened(params["jaxpr"]), [*fixed, *carry, *(np.asarray(x[k], object) for x in along)])
-        carry = outputs[:carried]
-        rows.append(outputs[carried:])
-    rows = rows[::-1] if params["reverse"] else rows
-    return [*carry, *(np.stack(column) for column in zip(*rows, strict=True))]
+    return [values[np.asarray(x, int)] for x in (indices if equation.primitive.multiple_results else [indices])]

@@ -126,6 +126,13 @@ def declared_model(case: plant.Case) -> StateSpaceModel:
     )
 
 
+def rate(model: StateSpaceModel, x: jax.Array, u: jax.Array, t: jax.Array) -> jax.Array:
+    """Rate of change of a state under inputs, with none before them, at a moment."""
+    row = Dataset(t[None] - 0.5 * model.dt, u[None], jnp.zeros((1, len(model.measured))), jnp.ones(1, bool))  # middle
+    inputs = jax.tree.map(lambda a: a[0], model.inputs(row))
+    return model.rate(x, inputs, jnp.zeros(len(model.system.coordinates)))
+
+
 def around(model: StateSpaceModel) -> SearchScales:
     """What a search knows of a two-link arm: sizes of torques, rates and angles, all measured."""
     return SearchScales(

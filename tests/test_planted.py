@@ -1,33 +1,31 @@
-"""Planted effects: a model with the effect makes of the written log the motion that the real torque made."""
+"""Planted effects: their laws are those of the catalogue, and a model with them moves as the recording."""
 
 import csv
 import io
 import tomllib
-from typing import ClassVar
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import planted_make
 import pytest
-from planted_cases import CASES, CONTROLS, LAWS, PLANTED, REST, Plant, case_of, split
+from helpers import rate
+from planted_cases import CASES, CONTROLS, LAWS, PLANTED, REST, Motion, Plant, case_of, split
 from planted_table import cases, score, table
 
-from nnap_em.data.dataset import Dataset
 from nnap_em.data.logs import check_split, read_logs
 from nnap_em.data.rig import read_rig
 from nnap_em.diagnosis.interventions import Intervention
 from nnap_em.effects import AbstractEffect
-from nnap_em.effects.actuator import DeadZone, InputDelay, MotorGain, OneSidedLoss
-from nnap_em.effects.base import JointEffect, a
+from nnap_em.effects.actuator import DeadZone, MotorGain, OneSidedLoss
+from nnap_em.effects.base import a
 from nnap_em.effects.friction import LoadFriction, PositionDependentFriction
 from nnap_em.effects.mounting import BaseVibration
 from nnap_em.effects.position import Cogging, EddyBrake, TorsionalSpring
 from nnap_em.effects.rate import AirDrag
-from nnap_em.effects.sensor import SensorBias, SensorDelay, SensorScale
+from nnap_em.effects.sensor import SensorBias, SensorScale
 from nnap_em.model.simulate import simulate
-from nnap_em.model.state_space import StateSpaceModel, with_effects
+from nnap_em.model.state_space import Inputs, StateSpaceModel, with_effects
 from nnap_em.numerics.gaussian import Gaussian
 from nnap_em.report.diagnosis import _disturbance
 from nnap_em.systems import specs
@@ -39,21 +37,6 @@ BODY = {
 }  # fmt: skip
 FRICTION = {"friction1": 0.25, "friction2": 0.19}
 DT, ROWS = 0.01, 101
-
-
-class _Force(JointEffect):
-    """A force of position, velocity and time that the catalogue lacks."""
-
-    name: ClassVar[str] = "test"
-    law: str = eqx.field(static=True)
-    pairs: tuple[tuple[str, float], ...] = eqx.field(static=True)
-
-    def force(self, scene, memory):
-        p, q, v = dict(self.pairs), self.own(scene.q), self.own(scene.v)
-        if self.law == "square":
-            return self.at(scene, p["amplitude"] * jnp.sign(jnp.sin(2 * jnp.pi * p["frequency"] * scene.time)))
-        bump = p["amplitude"] * jnp.exp(-(((q - p["center"]) / p["width"]) ** 2) / 2)
-        return self.at(scene, bump if self.law == "bump" else -bump * jnp.tanh(v / REST))
 
 
 def _model(effects: tuple[AbstractEffect, ...] = ()) -> StateSpaceModel:
@@ -77,28 +60,13 @@ def _motion(u: np.ndarray, effects: tuple[AbstractEffect, ...] = ()) -> np.ndarr
     return np.asarray(simulate(_model(effects), start, jnp.asarray(u)[None], key=jax.random.key(0)).x[0])
 
 
-def _torques() -> np.ndarray:
-    """Torques of two frequencies; 0 in the first rows, as a delay must find them."""
+@pytest.fixture(scope="module")
+def log() -> dict[str, np.ndarray]:
+    """A motion under torques of two frequencies."""
     t = DT * np.arange(ROWS)
     u = np.stack([0.9 * np.sin(7 * t) + 0.3 * np.sin(23 * t), 0.5 * np.sin(9 * t + 1)], axis=-1)
-    return np.where(np.arange(ROWS)[:, None] < 5, 0.0, u)
-
-
-def _log(x: np.ndarray, u: np.ndarray) -> dict[str, np.ndarray]:
-    columns = dict(zip((*planted_make.STATES, *planted_make.INPUTS), np.hstack([x, u]).T, strict=True))
-    return {"time": DT * np.arange(len(x)), **columns}
-
-
-def _unknown(tag: str, joint: int, **values: float):
-    return tag, joint, values, _Force(tag, tuple(values.items()), joint=joint)
-
-
-def _recorded(*plants: tuple[Plant, dict]) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray], np.ndarray]:
-    """Torques and states, the log of them with these effects planted, and its inputs."""
-    u = _torques()
-    x = _motion(u)
-    written = planted_make.planted(_log(x, u), list(plants), BODY | FRICTION, DT)
-    return u, x, written, np.stack([written[name] for name in planted_make.INPUTS], axis=-1)
+    columns = (*planted_make.STATES, *planted_make.INPUTS)
+    return {"time": t, **dict(zip(columns, np.hstack([_motion(u), u]).T, strict=True))}
 
 
 def _wave(size: float, phase: float):
@@ -106,93 +74,110 @@ def _wave(size: float, phase: float):
     return a(size * np.cos(phase)), a(size * np.sin(phase))
 
 
-FORCES = [
-    ("spring", 2, {"k": 0.5, "theta0": 0.3}, TorsionalSpring(a(0.5), a(0.15), a(0.0), a(0.0), joint=2)),
-    ("cogging", 1, {"k": 4.0, "amplitude": 0.3, "phase": 0.7}, Cogging(*_wave(0.3, 0.7), a(4.0), joint=1)),
-    (
-        "ripple",
+FORCES = {
+    "spring": (2, {"k": 0.5, "theta0": 0.3}, TorsionalSpring.of(0.5, 0.15, 0.0, 0.0, joint=2)),
+    "cogging": (1, {"k": 4.0, "amplitude": 0.3, "phase": 0.7}, Cogging(*_wave(0.3, 0.7), a(4.0), joint=1)),
+    "ripple": (
         2,
         {"k": 4.0, "amplitude": 0.2, "phase": 0.0, "overtone": 0.5, "phase2": 0.0},
         Cogging(a(0.2), a(0.0), a(4.0), 4.0, 0.1, 0.0, joint=2),
     ),
-    ("drag", None, {"c": 1.0}, AirDrag(a(1.0))),
-    (
-        "friction",
+    "drag": (None, {"c": 1.0}, AirDrag(a(1.0))),
+    "friction": (
         2,
         {"depth": 0.8, "n": 3.0, "phase": 0.6},
         PositionDependentFriction(*_wave(0.8, -0.6), a(3.0), joint=2),
     ),
-    ("brake", 1, {"c": 0.2, "center": 0.4}, EddyBrake(*_wave(0.2, 0.8), joint=1)),
-    ("shake", None, {"amplitude": 2.0, "frequency": 1.7, "phase": 0.5}, BaseVibration(*_wave(2.0, 0.5), a(1.7))),
-    _unknown("bump", 2, amplitude=0.4, center=-0.2, width=0.3),
-    _unknown("patch", 1, amplitude=0.4, center=0.2, width=0.3),
-    _unknown("square", 2, amplitude=0.3, frequency=2.5, phase=0.0),
-    ("load", 2, {"mu": 0.4}, LoadFriction(a(0.4), a(REST), names=("tau2", "dtheta2"), joint=2)),
-]
-DRIVES = [
-    ("gain", 1, {"gain": 0.7}, MotorGain(a(-0.3), joint=1)),
-    ("deadzone", 2, {"width": 0.2}, DeadZone(a(0.2), joint=2)),
-    ("delay", 1, {"delay": 3 * DT}, InputDelay(a(3 * DT), joint=1)),
-    ("onesided", 2, {"loss": 0.4}, OneSidedLoss(a(0.4), -1, "tau2", joint=2)),
-]
-SENSORS = [
-    ("bias", "theta1", {"bias": 0.2}, SensorBias(a(0.2), channel="theta1")),
-    ("scale", "dtheta2", {"scale": 1.2}, SensorScale(a(0.2), channel="dtheta2")),
-    ("late", "theta2", {"delay": DT}, SensorDelay(a(DT), channel="theta2")),
-    ("late", "all", {"delay": DT}, SensorDelay(a(DT), channel="all")),
-]
-
-
-def _tag(value) -> str:
-    return value if isinstance(value, str) else ""
-
-
-@pytest.mark.slow  # fast: test_effects.py
-@pytest.mark.parametrize(("tag", "joint", "values", "effect"), FORCES, ids=_tag)
-def test_the_model_with_a_force_moves_as_the_recording(tag, joint, values, effect):
-    """Up to what the torque that is held over a step leaves: a hundredth of what the effect does."""
-    _, x, _, u = _recorded((Plant(tag, joint, None), values))
-    lacking, right = _motion(u), _motion(u, (effect,))
-    assert np.abs(lacking - x).max() > 0.05
-    assert np.abs(right - x).max() < 0.01 * np.abs(lacking - x).max()
-
-
-@pytest.mark.slow  # fast: test_effects.py
-@pytest.mark.parametrize(("tag", "joint", "values", "effect"), DRIVES, ids=_tag)
-def test_a_drive_makes_the_real_torque_of_the_written_input(tag, joint, values, effect):
-    u, x, _, commanded = _recorded((Plant(tag, joint, None), values))
-    assert np.abs(commanded - u).max() > 0.05
-    np.testing.assert_allclose(_motion(commanded, (effect,)), x, rtol=0, atol=1e-9)
-
-
-@pytest.mark.slow  # fast: test_effects.py
-@pytest.mark.parametrize(("tag", "channel", "values", "effect"), SENSORS, ids=_tag)
-def test_a_sensor_reads_what_the_law_says(tag, channel, values, effect):
-    u, x, written, _ = _recorded((Plant(tag, None, channel), values))
-    model = _model((effect,))
-    cut = ROWS - len(written["time"])
-    seq = Dataset(DT * jnp.arange(ROWS, dtype=float), jnp.asarray(u), jnp.asarray(x), jnp.ones(ROWS, bool))
-    readings = np.asarray(jax.vmap(model.emission)(jnp.asarray(x), model.inputs(seq)))[cut:]
-    recorded = np.stack([written[name] for name in planted_make.STATES], axis=-1)
-    assert np.abs(recorded - x[cut:]).max() > 0.01
-    # the library looks back along the equation of motion
-    atol = 1e-3 * np.abs(recorded - x[cut:]).max() if tag == "late" else 1e-12
-    np.testing.assert_allclose(recorded, readings, rtol=0, atol=atol)
-    np.testing.assert_array_equal(written["tau1"], u[cut:, 0])
-    assert written["time"][0] == 0
-
-
-@pytest.mark.slow  # fast: test_effects.py
-def test_two_effects_together_move_as_the_recording():
-    """The drive makes of the written input the real torque without the force."""
-    (_, joint, spring, force), (_, driven, gain, drive) = FORCES[0], DRIVES[0]
-    _, x, _, u = _recorded((Plant("gain", driven, None), gain), (Plant("spring", joint, None), spring))
-    np.testing.assert_allclose(_motion(u, (force, drive)), x, rtol=0, atol=0.01 * np.abs(_motion(u) - x).max())
+    "brake": (1, {"c": 0.2, "center": 0.4}, EddyBrake(*_wave(0.2, 0.8), joint=1)),
+    "shake": (None, {"amplitude": 2.0, "frequency": 1.7, "phase": 0.5}, BaseVibration(*_wave(2.0, 0.5), a(1.7))),
+}
+DRIVES = {
+    "gain": (1, {"gain": 0.7}, MotorGain(a(-0.3), joint=1)),
+    "deadzone": (2, {"width": 0.2}, DeadZone(a(0.2), joint=2)),
+    "onesided": (2, {"loss": 0.4}, OneSidedLoss(a(0.4), -1, "tau2", joint=2)),
+    "load": (2, {"mu": 0.4}, LoadFriction(a(0.4), a(REST), names=("tau2", "dtheta2"), joint=2)),
+}
+OF_THEIR_OWN = {
+    "bump": ({"amplitude": 0.4, "center": -0.2, "width": 0.3}, lambda q, v, t: 0.4 * np.exp(-((q + 0.2) ** 2) / 0.18)),
+    "patch": (
+        {"amplitude": 0.4, "center": 0.2, "width": 0.3},
+        lambda q, v, t: -0.4 * np.exp(-((q - 0.2) ** 2) / 0.18) * np.tanh(v / 0.3),
+    ),
+    "square": (
+        {"amplitude": 0.3, "frequency": 2.5, "phase": 0.0},
+        lambda q, v, t: 0.3 * (1 - 2 * (np.floor(5 * t) % 2)),
+    ),
+}
+"""Laws that the catalogue lacks, and their formulas."""
 
 
 @pytest.fixture(scope="module")
-def log():
-    return _log(_motion(_torques()), _torques())
+def states():
+    """Angles, rates, torques and times."""
+    rng = np.random.default_rng(0)
+    return *rng.normal(size=(3, 100, 2)), rng.uniform(0.0, 9.0, 100)
+
+
+def test_laws_are_those_of_the_catalogue(states):
+    """Forces at states, torques that inputs make, and readings."""
+    q, v, torque, t = states
+    inputs, planted = {}, {}
+    for tag, (joint, values, _) in DRIVES.items():
+        own = LAWS[tag].undo(torque[:, joint - 1], v[:, joint - 1], values, DT)
+        inputs[tag] = np.where(np.arange(1, 3) == joint, own[:, None], torque)
+
+    @jax.jit
+    @jax.vmap
+    def both(q, v, torque, t, inputs):
+        x, bare = jnp.concatenate([q, v]), _model()
+        free = rate(bare, x, torque, t)
+        changed = {tag: rate(_model((law,)), x, torque, t) - free for tag, (*_, law) in FORCES.items()}
+        driven = {tag: rate(_model((law,)), x, inputs[tag], t) for tag, (*_, law) in DRIVES.items()}
+        return {tag: bare.system.mass(q) @ change[2:] for tag, change in changed.items()}, driven, free
+
+    forces, driven, free = both(*map(jnp.asarray, (q, v, torque, t)), inputs)
+    for tag, (joint, values, _) in FORCES.items():
+        planted = LAWS[tag].force(Motion(q, v, t), joint or 0, values, BODY | FRICTION)
+        np.testing.assert_allclose(forces[tag], planted, rtol=1e-9, atol=1e-11, err_msg=tag)
+        assert np.abs(planted).max() > 0.1
+    for tag in DRIVES:
+        np.testing.assert_allclose(driven[tag], free, rtol=1e-9, atol=1e-9, err_msg=tag)
+        assert np.abs(inputs[tag] - torque).max() > 0.1
+    for tag, (values, formula) in OF_THEIR_OWN.items():
+        planted = LAWS[tag].force(Motion(q, v, t), 2, values, BODY | FRICTION)
+        np.testing.assert_allclose(planted, np.stack([0 * t, formula(q[:, 1], v[:, 1], t)], axis=1), atol=1e-12)
+    row = Inputs(a([0.0, 0.0]), a([0.0, 0.0]), a(0.0), a(0.0))
+    for channel, law, read, effect in (
+        ("theta1", "bias", {"bias": 0.2}, SensorBias(a(0.2), channel="theta1")),
+        ("dtheta2", "scale", {"scale": 1.2}, SensorScale(a(0.2), channel="dtheta2")),
+    ):
+        x, place = np.array([0.3, -0.4, 1.0, -2.0]), planted_make.STATES.index(channel)
+        assert _model((effect,)).emission(a(x), row)[place] == pytest.approx(LAWS[law].reading(x[place], read))
+
+
+def test_what_is_late_is_late_by_whole_rows(log):
+    """The input is written earlier, the sensor's reading later."""
+    late = planted_make.planted(log, [(Plant("late", None, "theta2"), {"delay": 2 * DT})], BODY, DT)
+    np.testing.assert_array_equal(late["theta2"], log["theta2"][:-2])
+    np.testing.assert_array_equal(late["theta1"], log["theta1"][2:])
+    np.testing.assert_array_equal(late["time"], log["time"][:-2])
+    early = planted_make.planted(log, [(Plant("delay", 1, None), {"delay": 3 * DT})], BODY, DT)
+    np.testing.assert_allclose(early["tau1"][:-3], log["tau1"][3:], atol=1e-12)
+
+
+@pytest.mark.slow  # fast: test_laws_are_those_of_the_catalogue
+def test_a_model_with_the_effects_moves_as_the_recording(log):
+    """A drive makes of the written input the real torque without the force; the force is held over a step."""
+    (driven, gain, drive), (joint, spring, force) = DRIVES["gain"], FORCES["spring"]
+    plants = [(Plant("gain", driven, None), gain), (Plant("spring", joint, None), spring)]
+    written = planted_make.planted(log, plants, BODY | FRICTION, DT)
+    u, x = (
+        np.stack([columns[n] for n in names], axis=-1)
+        for columns, names in ((written, planted_make.INPUTS), (log, planted_make.STATES))
+    )
+    lacking = np.abs(_motion(u) - x).max()
+    assert lacking > 0.05
+    np.testing.assert_allclose(_motion(u, (force, drive)), x, rtol=0, atol=0.01 * lacking)
 
 
 @pytest.mark.parametrize("tag", LAWS)
@@ -205,12 +190,9 @@ def test_strength_zero_changes_no_bit(tag, log):
     assert all(np.array_equal(same[name], log[name]) for name in log)
 
 
-def test_every_law_is_compared():
-    assert {tag for tag, *_ in (*FORCES, *DRIVES, *SENSORS)} == set(LAWS)
-
-
 def test_the_list_covers_what_it_must():
     assert len(PLANTED) >= 60 and len(set(CASES)) == len(CASES)
+    assert {*FORCES, *DRIVES, *OF_THEIR_OWN, "bias", "scale", "late", "delay"} == set(LAWS)
     used = [plant.tag for name in PLANTED for plant in case_of(name).plants]
     assert set(used) == set(LAWS)
     assert {case_of(name).strength for name in PLANTED} == {"strong", "medium", "weak"}

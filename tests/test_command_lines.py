@@ -219,7 +219,9 @@ def place(tmp_path_factory):
             one = fitted._replace(state=fitted.state._replace(best=best))
             save(root / name / "model.npz", one, notes={"logs": [str(root / logs)]})
         (root / "rod.xml").write_text(rod.FILE)
-        (root / "rod.toml").write_text(file_rig("rod.xml", ("hinge", "dhinge"), friction="none", dt=rod.DT))
+        (root / "rod.urdf").write_text(rod.URDF)
+        inputs = '[input]\ncolumns = ["tau"]\njoints = [1]\n'
+        (root / "rod.toml").write_text(file_rig("rod.urdf", ("hinge", "dhinge"), inputs, friction="none", dt=rod.DT))
         machine = begin(read_rig(root / "rod.toml", specs), rod.logs(0), key=jax.random.key(0))
         save(root / "rod" / "model.npz", machine)
     return root

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from helpers import file_rig, optimised
+from helpers import file_rig, optimised, rate
 
 from nnap_em.data.dataset import Dataset
 from nnap_em.data.rig import read_rig
@@ -19,10 +19,7 @@ from nnap_em.effects import catalogue
 from nnap_em.effects.function import Axis, UnknownFunction
 from nnap_em.export.c99 import torques, write_c
 from nnap_em.export.mjcf import write_mjcf
-from nnap_em.export.model import ExportError
-from nnap_em.export.urdf import write_urdf
 from nnap_em.fit.identify import Identified, begin
-from nnap_em.machines.mjcf import read_machine
 from nnap_em.model.state_space import with_effects
 from nnap_em.systems import specs
 
@@ -88,11 +85,9 @@ UNPLACED = {
 }
 
 
-def _rates(model, q, v, u):
+def _accelerations(model, q, v, u):
     """Accelerations of the library, of a state without an input before it."""
-    rows = Dataset(jnp.zeros(1), u[None], jnp.zeros((1, 2)), jnp.ones(1, bool))
-    inputs = jax.tree.map(lambda x: x[0], model.inputs(rows))
-    return model.rate(jnp.concatenate([q, v]), inputs, jnp.zeros(2))[2:4]
+    return rate(model, jnp.concatenate([q, v]), u, jnp.asarray(0.0))[2:]
 
 
 @pytest.fixture(scope="module")
@@ -100,7 +95,7 @@ def accelerations(bare):
     """States and inputs, and accelerations of the library by law."""
     states = np.random.default_rng(0).normal(size=(20, 3, 2)) * [[1.0], [2.0], [4.0]]
     models = {"none": bare[0].model} | {name: _with(bare[0], law).model for name, law in STATIC.items()}
-    one = lambda state: {name: _rates(model, *state) for name, model in models.items()}  # noqa: E731
+    one = lambda state: {name: _accelerations(model, *state) for name, model in models.items()}  # noqa: E731
     return states, jax.jit(jax.vmap(one))(a(states))
 
 
@@ -168,7 +163,7 @@ def test_compiled_c_gives_the_torques_of_the_library(bare, tmp_path):
     def one(q, v, wanted):
         tau = torques(driven)[1](q, v, wanted, jnp.zeros(1))[0] / a([1.0, 2.0])  # the second has a gear of 2
         whole = feedforward(q, v, wanted, a([0.3]))[0]
-        return whole, fitted.model.unknown(v), _rates(driven.model, q, v, tau)
+        return whole, fitted.model.unknown(v), _accelerations(driven.model, q, v, tau)
 
     whole, friction, reached = jax.jit(jax.vmap(one))(*a(states).swapaxes(0, 1))
     np.testing.assert_allclose(reached, states[:, 2], rtol=1e-9)
@@ -178,40 +173,3 @@ def test_compiled_c_gives_the_torques_of_the_library(bare, tmp_path):
         np.testing.assert_allclose(out, whole[k], rtol=1e-9, atol=1e-9)
         compiled.arm_friction(array(v), out)
         np.testing.assert_allclose(out, friction[k], rtol=1e-9, atol=1e-9)
-
-
-@pytest.mark.parametrize(
-    ("file", "servo"),
-    [
-        ("branch.xml", 'kind = "voltage"\nk = 0.3\nR = 2.0'),
-        ("arm.urdf", ""),
-        ("arm.urdf", 'kind = "position"\nkp = 9.0'),
-    ],
-    ids=["branch, voltage", "urdf", "urdf, position"],
-)
-def test_a_urdf_is_read_again_as_the_same_machine(tmp_path, file, servo):
-    path = Path(__file__).parent / "machines" / file
-    machine = read_machine(path)
-    (tmp_path / file).write_text(path.read_text())
-    text = RIG.replace("two.xml", file).replace('["rail", "pole"]', f'["{machine.joints[0].name}"]')
-    inputs = f'columns = ["u"]\njoints = [1]\n{servo}'
-    (tmp_path / "rig.toml").write_text(text.replace('columns = ["push", "turn"]', inputs))
-    rig, t = read_rig(tmp_path / "rig.toml", specs), 0.01 * np.arange(30.0)
-    logs = Dataset(t[None], np.sin(t)[None, :, None], np.sin(t)[None, :, None], np.ones((1, 30), bool))
-    fitted = begin(rig, logs, key=jax.random.key(0))
-    named = [line for line in write_urdf(fitted, tmp_path / "out.urdf") if "servo of u" in line]
-    assert len(named) == bool(servo)
-    if servo:
-        with pytest.raises(ExportError, match="for; write --urdf or --c instead"):
-            write_mjcf(fitted, tmp_path / "out.xml")
-    again, model = read_machine(tmp_path / "out.urdf"), mujoco.MjModel.from_xml_path(str(tmp_path / "out.urdf"))
-    rubs = [[(joint.damping, joint.dry) for joint in one.joints] for one in (machine, again)]
-    np.testing.assert_allclose(*rubs, atol=1e-9)
-    assert sum(body.mass for body in again.bodies) == pytest.approx(sum(body.mass for body in machine.bodies), abs=1e-9)
-    data, mass = mujoco.MjData(model), np.zeros((model.nv, model.nv))
-    places = np.random.default_rng(0).uniform(-1.0, 1.0, (3, model.nv))
-    masses = jax.jit(lambda places: jax.lax.map(lambda q: fitted.model.system.mass(q), places))(a(places))
-    for data.qpos[:], whole in zip(places, masses, strict=True):
-        mujoco.mj_forward(model, data)
-        mujoco.mj_fullM(model, data, mass)
-        np.testing.assert_allclose(mass, whole - np.diag([joint.armature for joint in machine.joints]), atol=1e-9)

@@ -1,6 +1,7 @@
 """A model whose machine came from a file: stored and exported without that file, and written back for MuJoCo."""
 
 import dataclasses
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -16,13 +17,16 @@ from machine_files import CASES, errors, friction, recorded
 from shell import ENVIRONMENT
 
 from nnap_em import identify
-from nnap_em.data.machine import unpacked
+from nnap_em.data.machine import Machine, unpacked
 from nnap_em.data.rig import Declared, Rig, read_rig
+from nnap_em.effects.actuator import Saturation
 from nnap_em.effects.body import Payload
 from nnap_em.effects.position import Cogging, TorsionalSpring
+from nnap_em.effects.rate import BackEmf
 from nnap_em.export.friction import FrictionForm, friction_form
-from nnap_em.export.mjcf import write_mjcf
+from nnap_em.export.mjcf import as_it_is, write_mjcf
 from nnap_em.export.model import ExportError, write_model
+from nnap_em.export.urdf import write_urdf
 from nnap_em.fit.identify import Identified, begin
 from nnap_em.fit.store import load, save
 from nnap_em.machines.mjcf import read_machine
@@ -103,18 +107,29 @@ def _physics(model: mujoco.MjModel, q: np.ndarray, v: np.ndarray) -> tuple[np.nd
     return mass, data.qfrc_bias - data.qfrc_spring
 
 
-@pytest.mark.parametrize("file", ["branch.xml", "arm.urdf"])
-def test_a_written_machine_is_the_same_in_mujoco(tmp_path, file):
+def _of_file(folder: Path, file: str, more: str, effects=()) -> tuple[Machine, Identified]:
+    """A machine of `machines/`, and a fit of it before its first epoch, its first joint read and driven."""
     path = Path(__file__).parent / "machines" / file
     machine = read_machine(path)
-    (tmp_path / file).write_text(path.read_text())
-    joints = [joint.name for joint in machine.joints]
-    text = file_rig(file, joints[:1], '[input]\ncolumns = ["u"]\njoints = [1]\n', friction="none")
-    (tmp_path / "rig.toml").write_text(text)
-    rig, t = read_rig(tmp_path / "rig.toml", specs), 0.01 * np.arange(30.0)
+    (folder / file).write_text(path.read_text())
+    text = file_rig(file, [machine.joints[0].name], more, friction="none")
+    (folder / "rig.toml").write_text(text)
+    rig, t = read_rig(folder / "rig.toml", specs), 0.01 * np.arange(30.0)
     logs = machine_files.Dataset(t[None], np.sin(t)[None, :, None], np.sin(t)[None, :, None], np.ones((1, 30), bool))
-    fitted = begin(rig, logs, key=jax.random.key(0))
-    assert write_mjcf(fitted, tmp_path / "out.xml") == []
+    return machine, begin(rig, logs, key=jax.random.key(0), effects=effects)
+
+
+INPUT = '[input]\ncolumns = ["u"]\njoints = [1]\n'
+
+
+@pytest.mark.parametrize(
+    ("file", "servo", "left"),
+    [("branch.xml", "", []), ("arm.urdf", 'kind = "position"\nkp = 9.0\n', ["the position servo of u: kp = 9"])],
+)
+def test_a_written_machine_is_the_same_in_mujoco(tmp_path, file, servo, left):
+    machine, fitted = _of_file(tmp_path, file, INPUT + servo)
+    joints = [joint.name for joint in machine.joints]
+    assert write_mjcf(fitted, tmp_path / "out.xml") == left
     written, system = mujoco.MjModel.from_xml_path(str(tmp_path / "out.xml")), fitted.model.system
     states = np.random.default_rng(0).uniform(-2.0, 2.0, (3, len(joints)))
     forces = jax.jit(lambda states: jax.lax.map(lambda q: (system.mass(q), system.bias(q, 0.0 * q)), states))
@@ -128,6 +143,46 @@ def test_a_written_machine_is_the_same_in_mujoco(tmp_path, file):
     motors = [motor[:2] for motor in machine.motors]
     assert [motor[:2] for motor in again.motors] == [*motors, ("u", 0)]  # the rig drives a joint without a motor
     assert again.joint_sensors == machine.joint_sensors
+
+
+@pytest.mark.parametrize("part", ["", "locked = { reach = 0.1 }\n"], ids=["whole", "a joint held"])
+def test_a_urdf_file_is_written_again_with_the_numbers_of_the_fit(tmp_path, part):
+    """MuJoCo's mass matrix and weight of it, which has all its joints; shapes, limits and fixed links stay."""
+    uncertain = (
+        "[model.uncertain]\nforearm.mass = { mean = 1.3, std = 0.1 }\nlift.armature = { mean = 0.2, std = 0.1 }\n"
+    )
+    effects = (
+        Payload(jnp.asarray(0.4), joint=3 if not part else 2),
+        BackEmf.of(0.5, joint=2),
+        Saturation.of(7.0, joint=1),
+    )
+    _, fitted = _of_file(tmp_path, "arm.urdf", part + uncertain + INPUT, effects)
+    left = write_urdf(fitted, tmp_path / "out.urdf")
+    assert left == ["saturation at joint 1: limit = 7", "the armature of lift"]
+    text = (tmp_path / "out.urdf").read_text()
+    for kept in ("package://arm/meshes/shoulder.stl", '<link name="flange" />', 'lower="-2" upper="2" effort="50"'):
+        assert kept in text
+    model = mujoco.MjModel.from_xml_string(re.sub(r"(?s)<visual>.*?</visual>", "", text))
+    np.testing.assert_allclose(model.dof_damping[:2], [0.0, 0.8])
+    np.testing.assert_allclose(model.dof_frictionloss[:2], [0.0, 0.5])
+    assert 'effort="7.0"' in text
+    system = as_it_is(fitted)
+    dof = len(system.coordinates)
+    for q in np.random.default_rng(0).uniform(-1.0, 1.0, (3, 3)):
+        q[2] = 0.1 if part else q[2]
+        mass, weight = jax.jit(lambda q: (system.mass(q), system.bias(q, 0.0 * q)))(q[:dof])
+        other, force = _physics(model, q, 0.0 * q)
+        np.testing.assert_allclose(other[:dof, :dof] + np.diag([0.0, 0.2, 0.0][:dof]), mass, rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(force[:dof], weight, rtol=1e-9, atol=1e-9)
+
+
+def test_a_link_that_would_weigh_less_than_nothing_is_named(tmp_path):
+    """Shoulder and its fixed links together have less than the links alone."""
+    uncertain = "[model.uncertain]\nforearm.mass = { mean = 0.2, std = 0.1 }\n"
+    _, fitted = _of_file(tmp_path, "arm.urdf", "locked = { reach = 0.0 }\n" + uncertain + INPUT)
+    assert write_urdf(fitted, tmp_path / "out.urdf") == [
+        "the numbers of forearm: links on its fixed joints alone have more"
+    ]
 
 
 OWNED = """<mujoco model="owned">
@@ -186,6 +241,8 @@ def test_a_file_is_written_where_its_meshes_are_gone(tmp_path):
 
 
 def test_a_fit_that_has_no_machine_file_is_refused(uncertain, tmp_path):
+    with pytest.raises(ExportError, match=r"cartpole.xml is no URDF file, .*; write --mjcf"):
+        write_urdf(uncertain, tmp_path / "out.urdf")
     with pytest.raises(ExportError, match="before fits held their machine's file; identify again"):
         write_mjcf(uncertain._replace(rig=_rig(file="")), tmp_path / "out.xml")
     model = dataclasses.replace(uncertain.model, system=paper_model().system)

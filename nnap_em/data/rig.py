@@ -101,6 +101,7 @@ class Declaration(NamedTuple):
     input_scales: Mapping[str, Mapping[str, float]] = {}
     equations: str = ""
     file: str = ""
+    urdf: str = ""
 
 
 @dataclass(frozen=True)
@@ -128,6 +129,7 @@ class Rig:
     horizon: float | None = None  # s; how far predictions are used, of equations; None: by their time constants
     input_hold: str = HOLD  # or SMOOTH
     file: str = dataclasses.field(default="", compare=False)  # MJCF of the machine, with shapes: to be written back
+    urdf: str = dataclasses.field(default="", compare=False)  # its URDF file as it was read, if it came from one
 
     @property
     def kinds(self) -> dict[str, str]:
@@ -249,6 +251,7 @@ def read_rig(path: Path | str, systems: Mapping[str, SystemSpec]) -> Rig:
         ranges=ranges,
         horizon=sampling.positive("horizon") if "horizon" in sampling.items else None,
         file=declaration.file,
+        urdf=declaration.urdf,
     )
     for column in (*rig.logged_inputs, *rig.measured):
         named, unit = named_unit(column, brackets=True)[1], rig.column_unit(column)

@@ -15,7 +15,6 @@ from ..effects import AbstractEffect
 from ..fit.identify import Identified
 from ..machines.spec import compiled, in_comment, mujoco, written
 from ..model import hooks
-from ..model.state_space import StateSpaceModel
 from ..storage.files import replace_own
 from ..systems.tree import Tree
 from .friction import REPORTED_MISS, FrictionForm, friction_forms
@@ -50,16 +49,12 @@ def write_mjcf(fitted: Identified, out: Path | str) -> list[str]:
         ExportError: the machine did not come from a file. Nothing is written.
     """
     out, model = Path(out), fitted.model
-    system, forms = as_it_is(fitted, model), friction_forms(fitted)
-    if model.servos:
-        raise ExportError(
-            "its inputs are commands of servos, which MJCF here has no form for; write --urdf or --c instead"
-        )
+    system, forms = as_it_is(fitted), friction_forms(fitted)
     if not fitted.rig.file:
         raise ExportError("it is from before fits held their machine's file; identify again")
-    file = _opened(fitted, model, system, forms)
+    file = _opened(fitted, system, forms)
     unplaced = placed(file, model.effects)
-    left = [
+    left = servos_of(fitted) + [
         f"friction of {name}: its form misses {100 * form.missed:.0f} % of the learned curve"
         for name, form in zip(system.coordinates, forms, strict=True)
         if form.missed > REPORTED_MISS
@@ -73,7 +68,8 @@ def write_mjcf(fitted: Identified, out: Path | str) -> list[str]:
     _springs(file)
     _noise(file, np.exp(0.5 * np.asarray(model.log_r)))
     for motor, element in zip(motors_of(fitted, system), list(file.spec.actuators), strict=False):
-        _motor(file, motor, element)
+        if motor.joint + 1 not in served(fitted):
+            _motor(file, motor, element)
     notes = "".join(f"\n  - {line}" for line in left) or " nothing"
     comment = f"Written by nnap_em {__version__} from {system.machine.file}.  Not in here:{notes} "
     file.spec.comment = f"{file.spec.comment}\n {in_comment(comment)}"
@@ -82,18 +78,31 @@ def write_mjcf(fitted: Identified, out: Path | str) -> list[str]:
     return left
 
 
-def as_it_is(fitted: Identified, model: StateSpaceModel) -> Tree:
+def as_it_is(fitted: Identified) -> Tree:
     """The machine with all that is estimated of its bodies.
 
     Raises ExportError where it did not come from a file.
     """
-    system = model.system
+    model, system = fitted.model, fitted.model.system
     if not isinstance(system, Tree):
         reason = f"the machine {fitted.rig.system!r} is built in, and has no file to be written back to"
         raise ExportError(f'{reason}; declare it by type = "mjcf" and its file')
     true = hooks.machine(model.effects, system, jnp.zeros(()))
     assert isinstance(true, Tree)
     return true
+
+
+def served(fitted: Identified) -> list[int]:
+    """Joints, counted from 1, whose inputs are commands of servos."""
+    pairs = zip(fitted.model.servos or (), fitted.model.system.joints, strict=False)
+    return [joint for servo, joint in pairs if servo.feeds_back]
+
+
+def servos_of(fitted: Identified) -> list[str]:
+    """Servos with their numbers, a sentence each."""
+    numbers = lambda servo: ", ".join(f"{key} = {float(value):.4g}" for key, value in servo.values.items())  # noqa: E731
+    servos = [servo for servo in fitted.model.servos or () if servo.values]
+    return [f"the {servo.kind} servo of {servo.column}: {numbers(servo)}" for servo in servos]
 
 
 def motors_of(fitted: Identified, system: Tree) -> list[Motor]:
@@ -116,7 +125,7 @@ def named(effect: AbstractEffect) -> str:
     return f"{effect.name}{at}{': ' + values if values else ''}"
 
 
-def _opened(fitted: Identified, model: StateSpaceModel, system: Tree, forms: Sequence[FrictionForm]) -> OpenFile:
+def _opened(fitted: Identified, system: Tree, forms: Sequence[FrictionForm]) -> OpenFile:
     """The machine's file with the numbers of the fit, before its laws."""
     spec, machine = mujoco().MjSpec.from_string(fitted.rig.file), system.machine
     simulated = compiled(Path(machine.file), spec)
@@ -129,14 +138,14 @@ def _opened(fitted: Identified, model: StateSpaceModel, system: Tree, forms: Seq
     for motor, element in zip(machine.motors, list(spec.actuators), strict=True):
         element.name = motor.name
     longest = 5e-4  # time step of a written file at most [s]
-    step = model.dt / math.ceil(model.dt / longest - 1e-9)
+    step = fitted.model.dt / math.ceil(fitted.model.dt / longest - 1e-9)
     spec.option.timestep, spec.option.integrator = step, int(mujoco().mjtIntegrator.mjINT_RK4)
     pull = np.zeros((len(forms), 4))
     for j, (joint, form) in enumerate(zip(machine.joints, forms, strict=True)):
         stiffness = float(system.values.get(f"{joint.name}.stiffness", joint.stiffness))
         pull[j, :2] = stiffness * joint.rest + form.offset, -stiffness
-    drives = {joint: Drive() for joint in system.joints}
-    file = OpenFile(spec, system, fitted.rig.measured, model.dt, step, pull, drives)
+    drives = {joint: Drive() for joint in system.joints if joint not in served(fitted)}
+    file = OpenFile(spec, system, fitted.rig.measured, fitted.model.dt, step, pull, drives)
     for motor in motors_of(fitted, system)[len(machine.motors) :]:
         acting_on(file, machine.joints[motor.joint].name, motor.name, motor.gear)
     return file

@@ -35,7 +35,9 @@ def write_model(fitted: Identified, out: Path | str) -> None:
         >>> nnap_em.export.write_model(fit, f"{folder}/plain")
     """
     if fitted.model.servos:
-        raise ExportError("its inputs are commands of servos, of which parameters.json has none; use --urdf or --c")
+        raise ExportError(
+            "its inputs are commands of servos, of which parameters.json has none; use --mjcf, --urdf or --c"
+        )
     replace_own({Path(out) / "parameters.json": json_text(parameters(fitted))})
 
 

@@ -71,6 +71,8 @@ def placed(file: OpenFile, effects: Sequence[AbstractEffect]) -> tuple[tuple[Abs
         try:
             if follower is not None:
                 raise NoPlace(f"it acts before {follower.name}, which has no place")
+            if of_command(effect) and effect.joint not in file.drives:
+                raise NoPlace("its command is that of a servo")
             if effect.name not in PLACES:
                 raise NoPlace("it has no plain element in MuJoCo")
             PLACES[effect.name](file, effect)
@@ -81,12 +83,8 @@ def placed(file: OpenFile, effects: Sequence[AbstractEffect]) -> tuple[tuple[Abs
 
 def of_command(effect: AbstractEffect) -> bool:
     """True for a law of what reaches a joint of the command."""
-    return takes_time(effect) or type(effect).drive is not AbstractEffect.drive
-
-
-def takes_time(effect: AbstractEffect) -> bool:
-    """True for a law of the command over time."""
-    return type(effect).input is not AbstractEffect.input
+    kind = type(effect)
+    return kind.input is not AbstractEffect.input or kind.drive is not AbstractEffect.drive
 
 
 def _follower(effects: Sequence[AbstractEffect], place: int) -> AbstractEffect | None:
@@ -129,10 +127,8 @@ def _back_emf(file: OpenFile, effect: Any) -> None:
 # --- bodies
 
 
-def _in_bodies(file: OpenFile, effect: Any) -> None:
-    """Mass, centre and inertia of the body, where the machine of the file has such a variation."""
-    if (effect.name, effect.joint) not in file.system.variations:
-        raise NoPlace("the machine does not vary so")
+def _payload(file: OpenFile, effect: Any) -> None:
+    """Mass, centre and inertia of the body."""  # that of `OpenFile.system`
 
 
 # --- between command and torque
@@ -206,10 +202,7 @@ PLACES: Mapping[str, Place] = {
     "torsional_spring": _spring,
     "torque_offset": _offset,
     "motor_back_emf": _back_emf,
-    "payload": _in_bodies,
-    "link_inertia": _in_bodies,
-    "link_length": _in_bodies,
-    "center_of_mass": _in_bodies,
+    "payload": _payload,
     "motor_gain": _gain,
     "saturation": _saturation,
     "input_delay": _delay,

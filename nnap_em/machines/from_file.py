@@ -24,7 +24,9 @@ def declare(root: Any) -> Declaration:
     if not isinstance(model.items.get("file"), str) or not model.items["file"]:
         model.refuse("file", None if "file" in model.items else "missing", f"write {line}")
     part = _part(model)
-    machine, file = read_file(root.path.parent / str(model.items["file"]), part)
+    path = root.path.parent / str(model.items["file"])
+    machine, file = read_file(path, part)
+    text = path.read_text(encoding="utf-8", errors="replace")
     possible = tuple(sensor.name for sensor in machine.sensors if sensor.kind in SENSE_UNITS)
     machine = machine._replace(
         file=str(model.items["file"]),
@@ -43,7 +45,17 @@ def declare(root: Any) -> Declaration:
     parameters = dict(_parameters(machine, model)) | drive_numbers(drives)
     machine = packed(machine._replace(gears=gears, motored=motored))
     scales = scaled(drives, ("time", *spec.states, *columns), root.table("input", absent={}))
-    return Declaration(spec, parameters, columns, joints, machine, kinds_of(drives), scales, file=file)
+    return Declaration(
+        spec,
+        parameters,
+        columns,
+        joints,
+        machine,
+        kinds_of(drives),
+        scales,
+        file=file,
+        urdf=text if "<robot" in text else "",
+    )
 
 
 def _gear(motor: Motor | None, drive: Drive) -> float:

@@ -46,7 +46,7 @@ def _mutants(table: str) -> tuple[Mutant, ...]:
 
 MUTANTS = _mutants("""
 # effects/actuator.py
-## test_observer.py::test_the_same_numbers_as_the_filter[a late input, a spring, a biased sensor]
+## test_observer.py::test_the_same_numbers_as_the_filter[a late input, a spring, a biased, late sensor]
 share of a late command
 - (1 - rows + late) * line[0] + (rows - late) * line[min(rows, 1)]
 + (rows - late) * line[0] + (1 - rows + late) * line[min(rows, 1)]

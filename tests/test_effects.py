@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import plant
 import pytest
-from helpers import around, declared_model
+from helpers import around, declared_model, rate
 
 from nnap_em.data.dataset import Dataset
 from nnap_em.effects import catalogue, fields
@@ -31,7 +31,7 @@ def _spring(e):
 
 
 def _bristle(e):
-    b = plant.drawn_friction(plant.Case(steps=STEPS, hidden=False, seed=3))[e["joint"] - 1]["b"]
+    b = plant.drawn_friction(_case())[e["joint"] - 1]["b"]
     numbers = (np.log(e["sigma0"]), 0.05 * np.sqrt(e["sigma0"]), b, 0.2, 1.0, 200.0)
     return catalogue["presliding_friction"](*map(_a, numbers), joint=e["joint"])
 
@@ -136,28 +136,6 @@ NOT_COMPARED = {
 }
 
 
-@jax.jit
-def _roll(model, starts, seqs):
-    """Readings along motions."""
-    step = lambda x, u: (model.transition(x, u), model.emission(x, u))  # noqa: E731
-    return jax.vmap(lambda start, seq: jax.lax.scan(step, start, model.inputs(seq))[1])(starts, seqs)
-
-
-def _both(case: plant.Case, effects):
-    """Noise-free readings of the simulator, of the model with the effects and of the model without."""
-    rig = plant.build(case)
-    u, t = plant.torques(case)[:3], plant.clocks(case)[:3]
-    start = plant.starts(case)[:3]
-    simulated = plant.noise_free(rig, plant.simulate(rig, start, u, t))
-    clock = t[:, None] + plant.DT * np.arange(u.shape[1])
-    seqs = Dataset(*map(jnp.asarray, (clock, u[..., None], simulated, np.ones(u.shape, bool))))
-    out = []
-    for model in (with_effects(declared_model(case), effects), declared_model(case)):
-        memory = model.start.mean.shape[0] - start.shape[1]
-        out.append(np.asarray(_roll(model, jnp.pad(jnp.asarray(start), ((0, 0), (0, memory))), seqs)))
-    return simulated, *out
-
-
 OF_EQUATIONS = {name for name, kind in catalogue.items() if kind.__module__ == "nnap_em.effects.equations"}
 """Laws of plants without joints; tests/test_equations.py has theirs."""
 
@@ -167,12 +145,41 @@ def test_every_effect_is_compared_with_the_simulator():
     assert not set(MAKE) & set(NOT_COMPARED)
 
 
+def _case(*effects) -> plant.Case:
+    return plant.Case(effects=effects, steps=STEPS, hidden=False, seed=3)
+
+
+@pytest.fixture(scope="module")
+def motions():
+    """Readings without noise along motions: of the simulator, of the model with the effect and of the one without."""
+    base = _case()
+    u, t, start = plant.torques(base)[:3], plant.clocks(base)[:3], plant.starts(base)[:3]
+    clock = t[:, None] + plant.DT * np.arange(u.shape[1])
+    read = np.zeros((*u.shape, len(plant.measured(base))))
+    seqs = Dataset(*map(jnp.asarray, (clock, u[..., None], read, np.ones(u.shape, bool))))
+
+    def along(model):
+        step = lambda x, u: (model.transition(x, u), model.emission(x, u))  # noqa: E731
+        memory = model.start.mean.shape[0] - start.shape[1]
+        starts = jnp.pad(jnp.asarray(start), ((0, 0), (0, memory)))
+        return jax.vmap(lambda start, seq: jax.lax.scan(step, start, model.inputs(seq))[1])(starts, seqs)
+
+    bare = {name: declared_model(_case(*CASES[name])) for name in MOTION}
+    full = {name: with_effects(model, (MAKE[name](CASES[name][0]),)) for name, model in bare.items()}
+    none = {"none": declared_model(base), "transmission": bare["backlash"]}  # with the drag of a motor of its own
+    mine = jax.jit(lambda: {name: along(model) for name, model in (full | none).items()})()
+    simulated = {}
+    for name in MOTION:
+        rig = plant.build(_case(*CASES[name]))
+        simulated[name] = plant.noise_free(rig, plant.simulate(rig, start, u, t))
+    without = {name: "transmission" if name in plant.TRANSMISSION else "none" for name in MOTION}
+    return {name: (simulated[name], mine[name], mine[without[name]]) for name in MOTION}
+
+
 @pytest.mark.parametrize("name", MOTION)
-def test_moves_as_the_independent_simulator_says(name):
-    case = plant.Case(effects=CASES[name], steps=STEPS, hidden=False, seed=3)
-    simulated, mine, without = _both(case, (MAKE[name](CASES[name][0]),))
-    rows = slice(6, None)  # a late sensor reads the start until the delay is over; one step backward knows no start
-    _compare(simulated[:, rows], mine[:, rows], without[:, rows], MOTION[name])
+def test_moves_as_the_independent_simulator_says(name, motions):
+    """From the sixth row on: a late sensor reads the start until the delay is over; one step backward knows none."""
+    _compare(*(np.asarray(path)[:, 6:] for path in motions[name]), MOTION[name])
 
 
 def _compare(simulated, mine, without, share):
@@ -198,15 +205,8 @@ def rates():
     bare = {n: declared_model(case) for n, case in cases.items()}
     full = {n: with_effects(model, (MAKE[AT_ONCE[n][1]](cases[n].effects[0]),)) for n, model in bare.items()}
 
-    def rate(model, x):
-        def at(x, u, t):
-            row = Dataset(t[None] - 0.5 * plant.DT, u[None], jnp.zeros((1, 1)), jnp.ones(1, bool))  # its middle counts
-            inputs = jax.tree.map(lambda a: a[0], model.inputs(row))
-            return model.rate(x, inputs, jnp.zeros(len(model.system.coordinates)))
-
-        return jax.vmap(at)(jnp.asarray(x), jnp.asarray(u), jnp.asarray(t))
-
-    mine, without = jax.jit(lambda: [{n: rate(each[n], states[n]) for n in each} for each in (full, bare)])()
+    of = lambda model, x: jax.vmap(lambda *at: rate(model, *at))(*map(jnp.asarray, (x, u, t)))  # noqa: E731
+    mine, without = jax.jit(lambda: [{n: of(each[n], states[n]) for n in each} for each in (full, bare)])()
     return {n: (plant.rates(plant.build(cases[n]), states[n], u[:, 0], t), mine[n], without[n]) for n in cases}
 
 
@@ -229,7 +229,7 @@ BRAKES = ("air_drag", "motor_back_emf", "eddy_brake", "position_dependent_fricti
 @pytest.mark.parametrize("name", BRAKES)
 def test_brakes_never_add_energy(name):
     """Power v . tau of friction and effect together at 500 states; without the friction where the effect is a force."""
-    case = plant.Case(effects=plant.STRONG[name], steps=STEPS, hidden=False, seed=3)
+    case = _case(*plant.STRONG[name])
     effect = MAKE[name](case.effects[0])
     model = with_effects(declared_model(case), (effect,))
     rng = np.random.default_rng(0)
@@ -258,7 +258,7 @@ def test_what_must_be_above_zero_is_refused_below(name):
 
 def test_a_bristle_gives_back_less_than_it_was_given():
     """Work of presliding friction over any path from a slack bristle on: none of it comes from nowhere."""
-    case = plant.Case(effects=plant.STRONG["presliding_friction"], steps=STEPS, hidden=False, seed=3)
+    case = _case(*plant.STRONG["presliding_friction"])
     effect = MAKE["presliding_friction"](case.effects[0])
     model = with_effects(declared_model(case), (effect,))
     rng, count, dt = np.random.default_rng(0), 4000, 1e-4
@@ -337,7 +337,7 @@ def test_absent_strength_is_no_effect():
 
 def test_a_vibration_has_a_period_in_the_recording():
     """A slower one is an acceleration that hardly changes, as a tilt is."""
-    kind, known_of = catalogue["base_vibration"], around(declared_model(plant.Case(steps=STEPS, hidden=False, seed=3)))
+    kind, known_of = catalogue["base_vibration"], around(declared_model(_case()))
     first = kind.candidates(known_of)[0].start
     assert float(first.frequency) == pytest.approx(1 / (known_of.duration[1] - known_of.duration[0]))
     assert first.is_physical()

@@ -56,35 +56,36 @@ def _model(effects=(), servos=None, **changes):
     return dataclasses.replace(model, log_q=loose, log_r=jnp.full(2, -4.0), servos=servos, **changes)
 
 
-SPRING = catalogue["torsional_spring"].of(0.3, 0.02, 0.0, 0.0, joint=1)
+LAW, NETWORK = catalogue, FrictionNetwork(NUMBER([2.0]), NUMBER([0.3]), key=jax.random.key(0))
 LAWS = {
-    "a late input, a spring, a biased sensor": (
-        (catalogue["input_delay"].of(0.12, joint=1), SPRING, catalogue["sensor_bias"].of(0.05, channel="x")), None,
-    ),
-    "a late input by whole rows, a late sensor": (
-        (catalogue["input_delay"].of(0.1, joint=1), catalogue["sensor_delay"].of(0.07, channel="x")), None,
+    "a late input, a spring, a biased, late sensor": (
+        (
+            LAW["input_delay"].of(0.12, joint=1), LAW["torsional_spring"].of(0.3, 0.02, 0.0, 0.0, joint=1),
+            LAW["sensor_bias"].of(0.05, channel="x"), LAW["sensor_delay"].of(0.07, channel="x"),
+        ),
+        None, {},
     ),
     "a torque of a late servo, a lag, a gain": (
-        (catalogue["actuator_lag"].of(0.2, joint=1), catalogue["motor_gain"].of(0.3, joint=1)),
-        (Servo("f", "torque", {"delay": NUMBER(0.03)}),),
+        (LAW["actuator_lag"].of(0.2, joint=1), LAW["motor_gain"].of(0.3, joint=1)),
+        (Servo("f", "torque", {"delay": NUMBER(0.03)}),), {},
     ),
-    "a servo with delay and lag": (
-        (catalogue["actuator_lag"].of(0.2, joint=1), catalogue["input_delay"].of(0.06, joint=1)),
+    "a servo with delay and lag, learned friction": (
+        (LAW["actuator_lag"].of(0.2, joint=1), LAW["input_delay"].of(0.06, joint=1)),
         (Servo("goal", "position", {k: NUMBER(v) for k, v in dict(kp=8.0, kd=1.0, delay=0.08, limit=3.0).items()}),),
+        {"unknown": NETWORK},
     ),
-    "a gain from a column, a bristle": (
-        (catalogue["presliding_friction"].of(0.0, 0.1, 0.0, 0.5, 0.5, 20.0, joint=1),),
-        (Servo("goal", "position", {"kp": NUMBER(8.0)}, (("kp", 0, 0.2),)),),
+    "a gain from a column, a bristle, an input late by whole rows": (
+        (LAW["presliding_friction"].of(0.0, 0.1, 0.0, 0.5, 0.5, 20.0, joint=1), LAW["input_delay"].of(0.1, joint=1)),
+        (Servo("goal", "position", {"kp": NUMBER(8.0)}, (("kp", 0, 0.2),)),), {},
     ),
-    "learned friction": ((), None, FrictionNetwork(NUMBER([2.0]), NUMBER([0.3]), key=jax.random.key(0))),
 }  # fmt: skip
 
 
 @pytest.mark.parametrize("laws", LAWS)
 def test_the_same_numbers_as_the_filter(laws):
     """The observer gives the numbers of the filter: by cubature with held inputs, by the tangent with smooth ones."""
-    effects, servos, *friction = LAWS[laws]
-    held = _model(effects, servos, **dict(zip(("unknown",), friction, strict=False)))
+    effects, servos, friction = LAWS[laws]
+    held = _model(effects, servos, **friction)
     data = _log(held, rows=60, columns=2 if laws.startswith("a gain from a column") else 1)
 
     @jax.jit

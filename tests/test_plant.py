@@ -37,24 +37,6 @@ def _mass(q):
     return np.array([[2 * a, both - a - b], [both - a - b, 2 * b]])
 
 
-def test_energy_is_that_of_two_rods():
-    """Kinetic energy from the velocities of the centres of mass, by differences of their positions."""
-    q, v, h = np.array([0.7, -1.1]), np.array([2.0, -3.0]), 1e-6
-    d = plant.SYSTEMS["acrobot"].parameters
-
-    def centres(q):
-        elbow = d["l1"] * np.array([np.sin(q[0]), -np.cos(q[0])])
-        rod = np.array([np.sin(q.sum()), -np.cos(q.sum())])
-        return d["lc1"] / d["l1"] * elbow, elbow + d["lc2"] * rod
-
-    speeds = [(a - b) / (2 * h) for a, b in zip(centres(q + h * v), centres(q - h * v), strict=True)]
-    kinetic = sum(m * s @ s for m, s in zip((d["m1"], d["m2"]), speeds, strict=True)) / 2
-    kinetic += (d["I1"] * v[0] ** 2 + d["I2"] * v.sum() ** 2) / 2
-    height = sum(m * 9.81 * c[1] for m, c in zip((d["m1"], d["m2"]), centres(q), strict=True))
-    energy = plant.energy(plant.build(plant.Case()), np.array([[*q, *v]]), 0.0)[0]
-    assert energy == pytest.approx(kinetic + height, rel=1e-8)
-
-
 def test_every_name_of_the_vocabulary_is_simulated(shared):
     names = set(json.loads((shared / "vocabulary.json").read_text()))
     assert set(plant.STRONG) == set(plant.WEAK) == names - {"asymmetric_friction", "unknown_function"}
@@ -104,16 +86,6 @@ def test_a_delay_of_half_a_sample_switches_in_the_middle():
         np.testing.assert_allclose(plant._runge_kutta(p, half, u[:, k - 1], t, 0.005), x[:, k + 1], atol=1e-12)
 
 
-def test_a_sensor_late_by_half_a_sample_reads_between_two_rows():
-    """Linear between them: off by at most a quarter of the squared time times the largest acceleration."""
-    late = ({"name": "sensor_delay", "channel": "all", "delay": 1.5 * plant.DT},)
-    case = SMALL._replace(effects=late)
-    x = _run(case)
-    read = plant.noise_free(plant.build(case), x)[:, 2:, 0]
-    bend = np.abs(np.diff(x[..., 0], 2, axis=1)).max()  # the largest acceleration, times the squared time
-    np.testing.assert_allclose(read, 0.5 * (x[:, 1:-1, 0] + x[:, :-2, 0]), rtol=0.0, atol=bend / 4)
-
-
 def test_a_coarse_encoder_reads_multiples_of_its_step():
     effect = plant.STRONG["sensor_quantization"][0]
     case = SMALL._replace(effects=(effect,))
@@ -121,18 +93,14 @@ def test_a_coarse_encoder_reads_multiples_of_its_step():
     np.testing.assert_allclose(y / effect["step"], np.round(y / effect["step"]), atol=1e-9)
 
 
-@pytest.mark.parametrize("name", ["backlash", "presliding_friction", "hard_stop", "joint_flexibility"])
+SLOW = [pytest.param(n, marks=pytest.mark.slow) for n in ("presliding_friction", "hard_stop", "joint_flexibility")]
+
+
+@pytest.mark.parametrize("name", ["backlash", *SLOW])  # fast: backlash
 def test_stiff_effects_are_integrated_finely_enough(name):
     """With one substep they are off by 6e-3 and more [rad], thrice what is allowed."""
     case = SMALL._replace(effects=plant.STRONG[name])
     np.testing.assert_allclose(_run(case)[..., :2], _run(case, substeps=60)[..., :2], atol=2e-3)
-
-
-def test_the_play_of_a_backlash_is_free():
-    p = plant.build(plant.Case(effects=plant.STRONG["backlash"]))
-    torque = plant._play(plant.STRONG["backlash"][0], np.array([-0.1, -0.07, 0.0, 0.07, 0.1]), np.zeros(5))
-    np.testing.assert_allclose(torque, [-0.5, 0, 0, 0, 0.5], atol=1e-12)
-    assert p.size == 6
 
 
 @pytest.mark.parametrize(

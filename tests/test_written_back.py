@@ -295,12 +295,9 @@ def test_a_dip_and_a_constant_are_read_off_a_curve():
 
 
 def test_a_dip_that_the_sign_hides_is_none():
-    """Friction that rises over 2 rad/s, a little faster at first: no torque breaks away."""
+    """Friction that rises over 2 rad/s, a little faster at first: no torque breaks away.  None has a form of zeros."""
     form = _form(-(0.3 + 0.6 * np.exp(-((4 * V / 0.5) ** 2))) * np.tanh(4 * V / 2.0), v=4 * V)
     assert form.breakaway == form.coulomb
-
-
-def test_no_friction_has_a_form_of_zeros():
     form = _form(0 * V, v=4 * V)
     assert (form.coulomb, form.breakaway, form.viscous, form.missed) == (0.0, 0.0, 0.0, 0.0)
 

@@ -152,7 +152,7 @@ sign of the Stribeck law
 - return -(level * jnp.tanh(v / self.smooth) + self.viscous * v)
 + return level * jnp.tanh(v / self.smooth) + self.viscous * v
 # effects/rate.py
-## test_effects.py::test_brakes_never_add_energy[motor_back_emf]
+## test_effects.py::test_accelerates_as_the_independent_simulator_says[motor_back_emf]
 a brake that pushes
 - -self.b * self.own(scene.v)
 + self.b * self.own(scene.v)

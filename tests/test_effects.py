@@ -222,59 +222,12 @@ def test_numbers_of_a_stiffening_spring_and_of_detents_are_those_that_were_writt
             np.testing.assert_allclose(value, law[key], rtol=1e-6)
 
 
-BRAKES = ("air_drag", "motor_back_emf", "eddy_brake", "position_dependent_friction", "friction_drift")
-"""Effects that take energy from the machine, whatever it does; the bristle may give back what it has stored."""
-
-
-@pytest.mark.parametrize("name", BRAKES)
-def test_brakes_never_add_energy(name):
-    """Power v . tau of friction and effect together at 500 states; without the friction where the effect is a force."""
-    case = _case(*plant.STRONG[name])
-    effect = MAKE[name](case.effects[0])
-    model = with_effects(declared_model(case), (effect,))
-    rng = np.random.default_rng(0)
-    x = jnp.asarray(rng.normal(size=(500, 4)) * [3.0, 3.0, 10.0, 10.0])
-    still = jnp.zeros((500, 1))
-    rows = Inputs(still, still, jnp.asarray(rng.uniform(0, 200, 500)), jnp.ones(500))
-
-    def power(x, row):
-        scene = model.scene(x, row)
-        force = effect.force(scene, jnp.zeros(0))
-        return scene.v @ force, scene.v @ (force + effect.friction(scene.friction, scene))
-
-    alone, whole = map(np.asarray, jax.jit(jax.vmap(power))(x, rows))
-    assert effect.is_physical()
-    assert np.all(alone <= 0) and np.all(whole < 0)
-    assert np.all(alone < 0) or np.all(alone == 0)  # a force, or a change of the friction
-
-
 @pytest.mark.parametrize("name", [name for name in MAKE if catalogue[name].above_zero])
 def test_what_must_be_above_zero_is_refused_below(name):
     effect = MAKE[name]({**plant.STRONG, **plant.UNNAMED}[name][0])
     number = lambda e: getattr(e, e.above_zero)  # noqa: E731
     below, none = (eqx.tree_at(number, effect, share * number(effect)) for share in (-1.0, 0.0))
     assert effect.is_physical() and not below.is_physical() and not none.is_physical()
-
-
-def test_a_bristle_gives_back_less_than_it_was_given():
-    """Work of presliding friction over any path from a slack bristle on: none of it comes from nowhere."""
-    case = _case(*plant.STRONG["presliding_friction"])
-    effect = MAKE["presliding_friction"](case.effects[0])
-    model = with_effects(declared_model(case), (effect,))
-    rng, count, dt = np.random.default_rng(0), 4000, 1e-4
-    t = dt * np.arange(count)
-    v = sum(a * np.sin(w * t[None] + b) for a, w, b in rng.uniform(0, 1, (6, 3, 50, 1)) * [[[3.0]], [[80.0]], [[6.3]]])
-    row = Inputs(jnp.zeros(1), jnp.zeros(1), _a(1.0), _a(1.0))
-
-    def step(memory, v):
-        scene = model.scene(jnp.zeros(5).at[3].set(v), row)
-        force = effect.force(scene, memory)[1] + scene.friction[1]
-        return memory + dt * effect.drift(scene, memory), force * v
-
-    power = jax.jit(jax.vmap(lambda v: jax.lax.scan(step, jnp.zeros(1), v)[1]))(jnp.asarray(v))
-    power = np.asarray(power)
-    assert np.any(power > 0)  # it does give back now and then
-    assert np.all(dt * np.cumsum(power, axis=1) <= dt * np.abs(power).max(axis=1, keepdims=True))  # Euler: a step late
 
 
 MORE = {"payload": {"centre_x", "centre_y", "centre_z"}}

@@ -15,6 +15,7 @@ import pytest
 from helpers import file_rig
 from machine_files import CASES, errors, friction, recorded
 from shell import ENVIRONMENT
+from written_back import ahead
 
 from nnap_em import identify
 from nnap_em.data.machine import Machine, unpacked
@@ -305,24 +306,6 @@ def test_a_dip_that_the_sign_hides_is_none():
 # --- identified, from logs that MuJoCo made
 
 
-def _ahead(text: str, x: np.ndarray, u: np.ndarray, rows: int = 100) -> float:
-    """Error of the coordinates over a second, of MuJoCo with this file, from the true state of the first row."""
-    model = mujoco.MjModel.from_xml_string(text)
-    model.opt.timestep = machine_files.DT / machine_files.FINE
-    model.opt.integrator = int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST)
-    model.jnt_limited[:] = 0
-    wrong = []
-    for path, push in zip(x, u, strict=True):
-        data = mujoco.MjData(model)
-        data.qpos[:], data.qvel[:] = np.split(path[0], 2)
-        for k in range(rows):
-            data.ctrl[:] = push[k]
-            for _ in range(machine_files.FINE):
-                mujoco.mj_step(model, data)
-            wrong.append(data.qpos - path[k + 1][: model.nv])
-    return float(np.sqrt(np.mean(np.square(wrong))))
-
-
 @pytest.mark.slow  # fast: test_a_written_machine_is_the_same_in_mujoco
 def test_friction_of_an_unread_pole_is_found_and_the_written_file_predicts_better(tmp_path):
     rig = _rig(parameters={"pole.mass": Declared(0.23, 0.05)})  # the owner's belief is off; the plant has 0.2
@@ -334,7 +317,7 @@ def test_friction_of_an_unread_pole_is_found_and_the_written_file_predicts_bette
     before = (MACHINES / "cartpole.xml").read_text().replace('mass="0.2"', 'mass="0.23"')
     write_mjcf(fitted, tmp_path / "identified.xml")
     logs, x = _logs(rig, sequences=4, rows=110, seed=7)
-    after = _ahead((tmp_path / "identified.xml").read_text(), x, logs.u)
-    assert after < 0.3 * _ahead(before, x, logs.u)
+    after = ahead((tmp_path / "identified.xml").read_text(), x, logs.u)
+    assert np.all(after < 0.3 * ahead(before, x, logs.u))
     mass = mujoco.MjModel.from_xml_path(str(tmp_path / "identified.xml")).body("pole").mass
     np.testing.assert_allclose(mass, float(fitted.model.system.parameter("pole.mass")), rtol=1e-6)

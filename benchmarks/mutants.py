@@ -492,11 +492,11 @@ autocovariance not over that of lag 0
 - np.maximum(pairs, 1.0) * (pairs[0] / sums[0]), pairs
 + np.maximum(pairs, 1.0), pairs
 # experiment/signals.py
-## test_design.py::test_inputs_keep_to_torque_and_its_change[Chirp]
+## test_design.py::test_inputs_keep_to_torque_and_its_change[chirp]
 a design that forgets the limit of torque
 - np.minimum(limits.high, rest + left)
 + rest + left + limits.high
-## test_design.py::test_inputs_keep_to_torque_and_its_change[Steps]
+## test_design.py::test_inputs_keep_to_torque_and_its_change[steps]
 a design that forgets how fast torque may change
 - most, out = limits.rate * (t[1] - t[0])
 + most, out = 9 * limits.rate * (t[1] - t[0])

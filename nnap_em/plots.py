@@ -4,7 +4,6 @@ Reports of the commands have more of them, in `nnap_em.report`.
 """
 
 import jax
-import numpy as np
 from jaxtyping import PRNGKeyArray
 from matplotlib.figure import Figure
 
@@ -54,10 +53,7 @@ def prediction(fitted: Identified, data: Dataset, given: float, *, key: PRNGKeyA
         2
     """
     one = jax.tree.map(lambda a: a[sequence : sequence + 1], data)
-    predicted, rows = predict(fitted, one, given, key=key), np.asarray(one.valid[0])
-    pair = np.asarray(predicted.mean)[0][rows], np.asarray(predicted.std)[0][rows]
-    t, y = (np.asarray(a)[0][rows] for a in (one.t, one.y))
-    return prediction_figure(t, y, names_of(fitted), {"fit": pair}, given)
+    return prediction_figure({"fit": predict(fitted, one, given, key=key)}, one, names_of(fitted), given)
 
 
 def residual(fitted: Identified, data: Dataset) -> Figure:

@@ -3,7 +3,6 @@
 import dataclasses
 import json
 import os
-import re
 from pathlib import Path
 
 import equinox as eqx
@@ -12,14 +11,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import nnap, optimised, written_again
+from rigs import slide_logs, slide_rig
 
 import nnap_em
 from nnap_em.data.dataset import Dataset
 from nnap_em.data.limits import Bounds
 from nnap_em.data.logs import read_logs
-from nnap_em.data.rig import RigError, read_rig
+from nnap_em.data.rig import Rig, RigError, read_rig, write_rig
 from nnap_em.diagnosis.residual import names_of
-from nnap_em.em.weights import Weights
+from nnap_em.errors import StoreError
 from nnap_em.experiment.criteria import Friction, Several, after, share
 from nnap_em.experiment.experiment import design
 from nnap_em.experiment.information import Fit, columns_of, information, known, linearised
@@ -27,11 +27,11 @@ from nnap_em.experiment.limits import DesignError, Limits, limits_of
 from nnap_em.experiment.play import Motions, allowed, motions
 from nnap_em.experiment.search import Effort
 from nnap_em.experiment.signals import FAMILIES, drawn, mutated, played
-from nnap_em.fit.identify import identify, parameter_table
+from nnap_em.fit.identify import Identified, identify, parameter_table
 from nnap_em.fit.predict import drawn_paths
-from nnap_em.fit.store import load
+from nnap_em.fit.store import read, save
 from nnap_em.numerics.gaussian import Gaussian
-from nnap_em.report.design import motion_figure
+from nnap_em.report.design import check_places, motion_figure, write_design
 from nnap_em.smoother.kalman import kalman_filter
 from nnap_em.systems import specs
 
@@ -39,12 +39,11 @@ LIMITS = Limits(
     np.asarray([-0.4, 0.1]), np.asarray([0.3, 0.5]), np.asarray([2.0, 1e9]),
     np.asarray([-2.0, -9.0]), np.asarray([2.0, 9.0]), np.zeros(2), np.zeros(2),
 )  # fmt: skip
-SIMULATE = ("--system", "slide", "--sequences", 8, "--test", 0, "--steps", 95)
 SMALL = Effort(pool=16, batch=16, rounds=2, tries=4)
 THREE = {"seconds": 2.4, "sequences": 3, "effort": SMALL}
 
 
-@pytest.mark.parametrize("family", range(len(FAMILIES)), ids=[type(f).__name__ for f in FAMILIES])
+@pytest.mark.parametrize("family", range(len(FAMILIES)), ids=[f.__name__ for f in FAMILIES])
 def test_inputs_keep_to_torque_and_its_change(family):
     rng, t = np.random.default_rng(3), 0.01 * np.arange(301)
     proposal = drawn(rng, 40, 2, 2)._replace(family=np.full(40, family))
@@ -94,26 +93,30 @@ def test_friction_near_rest_counts_as_much_as_all_the_rest():
     np.testing.assert_allclose(cost(nothing) - cost(slow), 0.5 * np.log(3.0), rtol=1e-9)  # eightfold more information
 
 
-# --- on the bench of the paper's acrobot
+# --- on a slide
 
 
 @pytest.fixture(scope="module")
-def fit(bench) -> tuple[Fit, Dataset, np.ndarray]:
-    _, model, rule, data, path = bench
-    weights: Weights = rule.weights(model)
-    size = weights.nodes.size + weights.prior.size
-    return Fit(model, weights.prior, weights.nodes, jnp.eye(size), 4 * jnp.eye(size)), data, np.asarray(path.mean)
+def slide(slide_fit) -> tuple[Rig, Dataset, Identified]:
+    """A slide whose mass is uncertain: rig, logs and fit."""
+    return slide_rig(), Dataset(*map(jnp.asarray, slide_logs(0))), slide_fit
 
 
-def test_information_is_the_mean_square_of_the_score(fit):
+@pytest.fixture(scope="module")
+def path(slide) -> jax.Array:
+    """Smoothed states of the logs."""
+    _, data, fitted = slide
+    return nnap_em.smooth(fitted, data).mean
+
+
+def test_information_is_the_mean_square_of_the_score(slide, path):
     """Fisher's identity, by brute force: readings drawn from the linearised model, their likelihood differentiated.
 
-    The torque of the node near 1 rad/s at joint 1 moves; all else stays, and the model is linear about the path.
+    The force of the node near a usual speed moves; all else stays, and the model is linear about the path.
     """
-    known_fit, data, path = fit
-    model, nodes = known_fit.model, known_fit.nodes
-    seq, x = jax.tree.map(lambda a: jnp.asarray(a)[0], data), jnp.asarray(path[0])
-    place = int(np.argmin(np.abs(np.asarray(nodes[0]) - 1.0)))
+    known_fit, seq, x = known(slide[-1]), jax.tree.map(lambda a: a[0], slide[1]), path[0]
+    model, speed = known_fit.model, np.median(np.abs(path[..., 1]))
+    place = int(np.argmin(np.abs(np.asarray(known_fit.nodes[0]) - speed)))
 
     @eqx.filter_jit
     def slope_of(known_fit, seq, x):
@@ -127,32 +130,15 @@ def test_information_is_the_mean_square_of_the_score(fit):
         return jax.jacfwd(innovations)(jnp.zeros(()))
 
     slope = slope_of(known_fit, seq, x)
-    expected = information(known_fit, jax.tree.map(lambda a: jnp.asarray(a)[:1], data), x[None, None])
+    expected = information(known_fit, slide[1], path[:, None])
     np.testing.assert_allclose(expected[0, place, place], float(jnp.sum(slope**2)), rtol=1e-8)
     assert expected[0, place, place] > 0
 
 
-# --- on a slide
-
-
-@pytest.fixture(scope="module")
-def slide(tmp_path_factory):
-    """A slide whose mass is uncertain: folder, rig, logs and fit."""
-    folder = tmp_path_factory.mktemp("design") / "slide"
-    assert nnap("simulate", folder, *SIMULATE) == 0
-    text = (folder / "rig.toml").read_text()
-    (folder / "rig.toml").write_text(re.sub(r"m = 1\.0\b", "m = { mean = 1.1, std = 0.2 }", text))
-    assert nnap("identify", folder, "--out", folder.parent / "fit", "--quiet") == 0
-    rig = read_rig(folder / "rig.toml", specs)
-    return folder, rig, read_logs(folder / "train", rig).data, load(folder.parent / "fit" / "model.npz")
-
-
-def test_information_along_the_logs_is_the_curvature_of_their_fit(slide):
+def test_information_along_the_logs_is_the_curvature_of_their_fit(slide, path):
     """The fit linearises over the whole posterior, a design along one motion: they agree to a few percent."""
-    *_, data, fitted = slide
-    expected, data = known(fitted), Dataset(*map(jnp.asarray, data))
-    path = nnap_em.smooth(fitted, data).mean
-    total = information(expected, data, path[:, None]).sum(axis=0)
+    _, data, fitted = slide
+    total = information(known(fitted), data, path[:, None]).sum(axis=0)
     weights = fitted.m_step.weights(fitted.model)
     hessian = jnp.asarray(total) + weights.prior_precision(fitted.model.unknown)
     std, fits = (float(np.sqrt(np.linalg.inv(np.asarray(h))[-1, -1])) for h in (hessian, fitted.state.hessian))
@@ -162,14 +148,14 @@ def test_information_along_the_logs_is_the_curvature_of_their_fit(slide):
 @pytest.mark.slow  # fast: test_information_along_the_logs_is_the_curvature_of_their_fit
 def test_what_is_promised_is_what_a_fit_then_states_and_the_truth_is_near(slide):
     """The design is played by the model that made the logs, with noise of its own."""
-    _, rig, data, fitted = slide
+    rig, data, fitted = slide
     truth = nnap_em.paper.examples["slide"]().model
     plan = {"question": "m", "seconds": 3.8, "sequences": 4, "effort": SMALL}
     designed = design(fitted, data, key=jax.random.key(1), **plan)
     made = nnap_em.simulate(truth, jnp.asarray(designed.start), jnp.asarray(designed.u), key=jax.random.key(9)).data
     both = Dataset(*(np.concatenate([a, b]) for a, b in zip(data, made, strict=True)))
     value, stated = parameter_table(identify(rig, both, key=jax.random.key(0)))["m"]
-    std = lambda expected: 0.2 * np.sqrt(after(np.asarray(designed.fit.cov), expected)[-1, -1])  # noqa: E731
+    std = lambda expected: 0.1 * np.sqrt(after(np.asarray(designed.fit.cov), expected)[-1, -1])  # noqa: E731
     assert 1 / 1.5 < std(designed.expected) / stated < 1.5
     assert abs(value - 1.0) < 4 * stated
     assert max(std(designed.expected), std(designed.old)) < std(designed.nothing)
@@ -177,26 +163,44 @@ def test_what_is_promised_is_what_a_fit_then_states_and_the_truth_is_near(slide)
 
 @pytest.fixture(scope="module")
 def plan(slide):
-    *_, data, fitted = slide
+    _, data, fitted = slide
     return design(fitted, data, key=jax.random.key(2), **THREE)
 
 
 def test_no_motion_of_a_design_leaves_what_the_logs_visited(slide, plan):
-    (*_, data, fitted), designed = slide, plan
+    _, data, fitted = slide
     paths = drawn_paths(fitted, 300, key=jax.random.key(77))
-    extremes = motions(paths, designed.limits, designed.t, designed.u, designed.start, 1, key=jax.random.key(78))
-    assert np.all(np.asarray(extremes.lowest) >= designed.limits.lowest[None, None])
-    assert np.all(np.asarray(extremes.highest) <= designed.limits.highest[None, None])
-    assert isinstance(designed.question, Several) and isinstance(designed.question.criteria[0], Friction)
-    whole, near = designed.question.criteria[0].weight
+    extremes = motions(paths, plan.limits, plan.t, plan.u, plan.start, 1, key=jax.random.key(78))
+    assert np.all(np.asarray(extremes.lowest) >= plan.limits.lowest[None, None])
+    assert np.all(np.asarray(extremes.highest) <= plan.limits.highest[None, None])
+    assert isinstance(plan.question, Several) and isinstance(plan.question.criteria[0], Friction)
+    whole, near = plan.question.criteria[0].weight
     np.testing.assert_allclose([whole.sum(), near.sum()], 1.0)
-    speed = np.abs(np.asarray(designed.fit.nodes))
-    assert (
-        speed[near > 0].max() <= designed.slow[0] < speed[whole > 0].max()
-    )  # the slowest rows once more by themselves
-    again, other = (design(fitted, data, key=jax.random.key(seed), **THREE) for seed in (2, 3))
-    np.testing.assert_array_equal(designed.u, again.u)  # the same seed, the same numbers
-    assert not np.array_equal(designed.u, other.u)
+    speed = np.abs(np.asarray(plan.fit.nodes))  # the slowest rows once more by themselves
+    assert speed[near > 0].max() <= plan.slow[0] < speed[whole > 0].max()
+    again = design(fitted, data, key=jax.random.key(2), **THREE)
+    np.testing.assert_array_equal(plan.u, again.u)  # the same seed, the same numbers
+
+
+def test_what_can_be_played_is_written_with_a_page(slide, plan, tmp_path):
+    """What a design before wrote goes; files of others are not touched."""
+    for out in (tmp_path, tmp_path):
+        write_design(out, plan, question="all", seed=2, began=0.0, log=lambda text: None)
+    document = json.loads((tmp_path / "design.json").read_text())
+    assert document["inputs"] == [f"inputs/{i}.csv" for i in (1, 2, 3)] and document["seconds_each"] == plan.t[-1]
+    for i, file in enumerate(document["inputs"]):
+        table = np.genfromtxt(tmp_path / file, delimiter=",", names=True)
+        assert table.dtype.names == ("time", "u")
+        np.testing.assert_allclose(table["u"], plan.u[i, :, 0], rtol=1e-6, atol=1e-9)
+    assert document["limits"]["values"]["u"] == [plan.limits.low[0], plan.limits.high[0]]
+    (friction,), mass = document["friction"], document["parameters"]["m"]
+    assert friction["near_rest"]["expected"] < friction["near_rest"]["now"] and mass["expected"] < mass["now"]
+    assert mass["now"] == pytest.approx(parameter_table(slide[-1])["m"][1])
+    html = (tmp_path / "design.html").read_text()
+    assert html.count("<img") == 2 and "None is declared" in html and document["verdict"] in html
+    (tmp_path / "inputs" / "4.csv").write_text("mine")
+    with pytest.raises(StoreError, match=r"4\.csv"):
+        check_places(tmp_path, 4)
 
 
 def test_a_motion_is_allowed_that_stays_inside_its_limits_by_more_than_its_spread():
@@ -212,7 +216,7 @@ def test_a_motion_is_allowed_that_stays_inside_its_limits_by_more_than_its_sprea
 
 
 def test_declared_limits_hold_and_wrong_ones_are_told(slide):
-    _, rig, data, fitted = slide
+    rig, data, fitted = slide
     path, used, system = np.zeros((8, 96, 2)), np.ones(8, bool), fitted.model.system
     path[:, :, 0] = np.linspace(-0.1, 0.2, 96)
     bounded = lambda **tables: dataclasses.replace(rig, limits=Bounds(**tables))  # noqa: E731
@@ -233,76 +237,53 @@ def test_declared_limits_hold_and_wrong_ones_are_told(slide):
         design(tight, data, key=jax.random.key(0), **THREE)
 
 
-@pytest.mark.parametrize(
-    "question, reason",
-    {
-        "spring": "possible here: friction, parameters, m, all",
-        "friction ": "not a question",
-    }.items(),
-)
-def test_a_question_that_the_fit_cannot_answer_is_told(slide, question, reason):
-    _, _, data, fitted = slide
-    with pytest.raises(DesignError, match=re.escape(reason)):
-        design(fitted, data, key=jax.random.key(0), question=question)
+def test_a_question_that_the_fit_cannot_answer_is_told(slide):
+    _, data, fitted = slide
+    for question, reason in (
+        ("spring", "possible here: friction, parameters, m, all"),
+        ("friction ", "not a question"),
+    ):
+        with pytest.raises(DesignError, match=reason):
+            design(fitted, data, key=jax.random.key(0), question=question)
+    with pytest.raises(DesignError, match="give more --seconds"):
+        design(fitted, data, key=jax.random.key(0), seconds=0.1)
 
 
 # --- the command
 
 
-@pytest.fixture(scope="module")
-def designed(slide) -> Path:
-    folder = slide[0].parent
-    order = ("design", folder / "fit", "--out", folder / "next", "--seconds", 6, "--sequences", 4, "--quiet")
-    with optimised():
-        assert nnap(*order) == 0
-    return folder / "next"
+def _simulated(folder: Path) -> Path:
+    assert nnap("simulate", folder, "--system", "slide", "--sequences", 8, "--test", 0, "--steps", 95) == 0
+    return folder
 
 
-@pytest.mark.slow  # fast: test_no_motion_of_a_design_leaves_what_the_logs_visited
-def test_the_command_writes_what_can_be_played_and_a_page(slide, designed):
-    expected = json.loads((designed / "design.json").read_text())
-    assert expected["inputs"] == [f"inputs/{i}.csv" for i in range(1, 5)] and expected["seconds_each"] == 1.5
-    table = np.genfromtxt(designed / expected["inputs"][0], delimiter=",", names=True)
-    assert table.dtype.names == ("time", "u") and len(table) == 151
-    low, high = expected["limits"]["values"]["u"]
-    assert low <= table["u"].min() and table["u"].max() <= high
-    assert expected["friction"][0]["near_rest"]["expected"] < expected["friction"][0]["near_rest"]["now"]
-    assert expected["parameters"]["m"]["expected"] < expected["parameters"]["m"]["now"]
-    page = (designed / "design.html").read_text()
-    assert page.count("<img") == 3 and "None is declared" in page and expected["verdict"].split(" should")[0] in page
-    assert not (designed / "unfinished").exists()
-
-
-@pytest.mark.slow  # fast: test_no_motion_of_a_design_leaves_what_the_logs_visited
-def test_old_and_new_logs_are_fitted_together(slide, designed, tmp_path, capsys, monkeypatch):
+@pytest.mark.slow  # fast: test_what_can_be_played_is_written_with_a_page
+def test_old_and_new_logs_are_fitted_together_and_designed_for(tmp_path, monkeypatch):
     """The new logs are the old ones with other names and other noise: all are there, each once, from another folder."""
-    folder, _, data, _ = slide
-    new = tmp_path / "new"
+    old, new, out = _simulated(tmp_path / "old"), tmp_path / "new", tmp_path / "fit"
     new.mkdir()
+    data = read_logs(old / "train", read_rig(old / "rig.toml", specs)).data
     for i, (u, y) in enumerate(zip(data.u, data.y, strict=True)):
         rows = [f"{t:.2f},{a[0]!r},{b[0] + 1e-4!r}" for t, a, b in zip(data.t[i], u.tolist(), y.tolist(), strict=True)]
         (new / f"{i}.csv").write_text("\n".join(["time,u,x", *rows]) + "\n")
-    out = tmp_path / "fit"
-    monkeypatch.chdir(folder)
-    assert nnap("identify", ".", "--more", os.path.relpath(new, folder), "--out", out, "--epochs", 2, "--quiet") == 0
+    monkeypatch.chdir(old)
+    assert nnap("identify", ".", "--more", os.path.relpath(new, old), "--out", out, "--epochs", 2, "--quiet") == 0
     monkeypatch.chdir(tmp_path)
     assert "to 16 sequences" in json.loads((out / "report.json").read_text())["verdict"]
-    from nnap_em.fit.store import read
+    assert read(out / "model.npz").notes["logs"] == [str(old), str(new)]
+    with optimised():
+        assert nnap("design", out, "--out", tmp_path / "next", "--seconds", 6, "--sequences", 4, "--quiet") == 0
+    document = json.loads((tmp_path / "next" / "design.json").read_text())
+    assert document["seconds_each"] == 1.5 and len(document["inputs"]) == 4
+    assert not (tmp_path / "next" / "unfinished").exists()
 
-    assert read(out / "model.npz").notes["logs"] == [str(folder), str(new)]
-    again = nnap("design", out, "--out", tmp_path / "next", "--seconds", 0.1, "--quiet")
-    assert again == 2 and "give more --seconds" in capsys.readouterr().err
 
-
-def test_logs_that_are_not_those_of_the_fit_are_refused(slide, tmp_path, capsys):
-    folder = slide[0]
-    other = tmp_path / "other"
-    assert nnap("simulate", other, *SIMULATE, "--seed", 5) == 0
-    text = (folder / "rig.toml").read_text()
-    (other / "rig.toml").write_text(text)
-    assert nnap("design", folder.parent / "fit", "--logs", other, "--out", tmp_path / "next") == 2
+def test_logs_that_are_not_those_of_the_fit_are_refused(slide_fit, tmp_path, capsys):
+    save(tmp_path / "fit" / "model.npz", slide_fit, fingerprint="other")
+    other = _simulated(tmp_path / "other")
+    assert nnap("design", tmp_path / "fit", "--logs", other, "--out", tmp_path / "next") == 2
     assert "not the logs, or not read as those, of the fit" in capsys.readouterr().err
-    assert nnap("design", folder.parent / "fit", "--logs", tmp_path / "gone", "--out", tmp_path / "next") == 2
+    assert nnap("design", tmp_path / "fit", "--logs", tmp_path / "gone", "--out", tmp_path / "next") == 2
     assert "its logs are not at" in capsys.readouterr().err
     assert not (tmp_path / "next").exists()
 
@@ -312,36 +293,38 @@ def test_logs_that_are_not_those_of_the_fit_are_refused(slide, tmp_path, capsys)
 BOUNDS = "\n[limits]\nu = 0.5\nx = [-1, 2.5]\n[limits.rate]\nu = 4\n[limits.start]\nx = 0.25\n"
 
 
-def test_limits_are_read_and_written(slide, tmp_path):
+def test_limits_are_read_and_written(tmp_path):
     path = tmp_path / "rig.toml"
-    path.write_text((slide[0] / "rig.toml").read_text() + BOUNDS)
+    write_rig(slide_rig(), path)
+    path.write_text(path.read_text() + BOUNDS)
     rig = read_rig(path, specs)
     assert rig.limits == Bounds({"u": (-0.5, 0.5), "x": (-1.0, 2.5)}, {"u": (-4.0, 4.0)}, {"x": (0.25, 0.25)})
     assert written_again(rig, tmp_path) == rig
 
 
-@pytest.mark.parametrize(
-    "lines, reason",
-    [
-        ("[limits]\nU = 1", r"\[limits\] U: unknown table or key; did you mean 'u'"),
-        ("[limits]\nu = 0", r"\[limits\] u: found 0; write .*above 0"),
-        ("[limits]\nx = [2, 1]", r"\[limits\] x: found \[2, 1\]; write the lower bound first"),
-        ('[limits]\nu = "1"', r"\[limits\] u: found '1'; write u = 0.3 or"),
-        ("[limits]\nrate = 3", r"\[limits\] rate: found 3; write a table \[limits.rate\]"),
-        ("[limits.rate]\nx = 3", r"\[limits.rate\] x: unknown"),
-        ("[limits.start]\nu = 3", r"\[limits.start\] u: unknown"),
-    ],
+WRONG = (
+    ("[limits]\nU = 1", r"\[limits\] U: unknown table or key; did you mean 'u'"),
+    ("[limits]\nu = 0", r"\[limits\] u: found 0; write .*above 0"),
+    ("[limits]\nx = [2, 1]", r"\[limits\] x: found \[2, 1\]; write the lower bound first"),
+    ('[limits]\nu = "1"', r"\[limits\] u: found '1'; write u = 0.3 or"),
+    ("[limits]\nrate = 3", r"\[limits\] rate: found 3; write a table \[limits.rate\]"),
+    ("[limits.rate]\nx = 3", r"\[limits.rate\] x: unknown"),
+    ("[limits.start]\nu = 3", r"\[limits.start\] u: unknown"),
 )
-def test_wrong_limits_are_refused(slide, tmp_path, lines, reason):
+
+
+def test_wrong_limits_are_refused(tmp_path):
     path = tmp_path / "rig.toml"
-    path.write_text((slide[0] / "rig.toml").read_text() + "\n" + lines + "\n")
-    with pytest.raises(RigError, match=reason):
-        read_rig(path, specs)
+    write_rig(slide_rig(), path)
+    text = path.read_text()
+    for lines, reason in WRONG:
+        path.write_text(f"{text}\n{lines}\n")
+        with pytest.raises(RigError, match=reason):
+            read_rig(path, specs)
 
 
-def test_the_figure_shows_all_of_every_input(slide, plan):
+def test_the_figure_shows_all_of_every_input(plan):
     """Rows share their axis: a sequence that hardly moves, at the end, hides nothing of the first."""
-    fitted = slide[-1]
     u = np.broadcast_to(np.asarray([3.0, 1.0, 0.01])[:, None, None], plan.u.shape)
-    low, high = motion_figure(plan._replace(u=u), names_of(fitted), range(3)).axes[0].get_ylim()
+    low, high = motion_figure(plan._replace(u=u), names_of(plan.fitted), range(3)).axes[0].get_ylim()
     assert low < 0.01 and high > 3.0

@@ -118,15 +118,14 @@ def test_a_law_by_many_steps_has_shares_and_one_that_was_read_off_has_nats():
     assert finding.curve is None and finding.shape is None and "shape" not in entry(finding)
 
 
-def _doubtful() -> Diagnosis:
-    """A search that saw a spring and a dead zone that are even."""
-    zone, spring = (key_of(e) for e in (_law("dead_zone"), _spring(1)))
-    last = Step(ROWS, (), (), None, 3, rivals=(zone, spring))
-    return _closed(ARM)._replace(steps=(Step(ROWS, (), (), zone, 3), last))
-
-
 def _law(name: str) -> AbstractEffect:
     return catalogue[name](jnp.asarray(0.1), joint=2)
+
+
+RIVALS = tuple(key_of(effect) for effect in (_law("dead_zone"), _spring(1)))
+SUSPECT = Suspect(key_of(_law("motor_gain")), 0.18, 0.03)
+LAST = Step(ROWS, (), (), None, 3, rivals=RIVALS, suspects=(SUSPECT,))
+"""A round that saw a spring and a dead zone that are even, and suspects a gain."""
 
 
 def test_a_fit_says_what_it_was_fitted_to():
@@ -138,7 +137,7 @@ def test_a_fit_says_what_it_was_fitted_to():
 
 
 def test_what_cannot_be_told_is_a_verdict():
-    rivals = undecided(_doubtful())
+    rivals = undecided(_closed(ARM)._replace(steps=(Step(ROWS, (), (), RIVALS[0], 3), LAST)))
     text = verdict([], None, 3, rivals)
     assert "cannot tell" in text and "dead zone at joint 2 and torsional spring at joint 1" in text
     assert len(advice([], rivals)) == 2
@@ -148,8 +147,7 @@ def test_what_cannot_be_told_is_a_verdict():
 
 
 def test_a_suspect_is_named_with_its_share_and_the_chance_level():
-    step = Step(ROWS, (), (), None, 3, suspects=(Suspect(key_of(_law("motor_gain")), 0.18, 0.03),))
-    (suspect,) = suspected(_closed(ARM)._replace(steps=(step,)))
+    (suspect,) = suspected(_closed(ARM)._replace(steps=(LAST,)))
     assert (suspect.name, suspect.joint, suspect.share_of_error, suspect.chance) == ("motor_gain", 2, 0.18, 0.03)
     assert suspect.description == (
         "motor gain at joint 2 would remove 18% of the squared prediction error, where chance removes up to 3%"
@@ -163,31 +161,34 @@ def test_a_suspect_is_named_with_its_share_and_the_chance_level():
         assert advice([], (), [suspect._replace(law=law)])[1].startswith(f"To see {named} by itself")
 
 
+def _written(tmp_path, diagnosis: Diagnosis, test: bool) -> tuple[dict, str]:
+    """Report and page."""
+    rig = diagnosis.before.rig
+    logs = Logs(("a.csv", "b.csv"), _data(rig), ("time", "u", *rig.measured))
+    ends = {"seed": 0, "began": 0.0, "log": lambda text: None}
+    write_diagnosis(tmp_path, diagnosis, findings(diagnosis), logs, logs if test else None, **ends)
+    return json.loads((tmp_path / "report.json").read_text()), (tmp_path / "report.html").read_text()
+
+
 @pytest.mark.slow  # fast: sentences of findings, here
 def test_the_page_tells_what_is_in_doubt(tmp_path):
-    logs = Logs(("a.csv", "b.csv"), _data(ARM), ("time", "u", "theta1", "theta2"))
-    doubtful = _doubtful()
-    suspects = (Suspect(key_of(_law("motor_gain")), 0.18, 0.03),)
-    doubtful = doubtful._replace(steps=(*doubtful.steps[:-1], doubtful.steps[-1]._replace(suspects=suspects)))
-    write_diagnosis(tmp_path, doubtful, [], logs, None, seed=0, began=0.0, log=lambda text: None)
-    report, html = json.loads((tmp_path / "report.json").read_text()), (tmp_path / "report.html").read_text()
+    report, html = _written(tmp_path, _closed(ARM)._replace(steps=(LAST,)), False)
     joints = report["visited"]
     assert [row["load"] is None for row in joints] == [True, False]  # the second is driven
     assert all(row["velocity"][0] < row["velocity"][1] for row in joints)
     assert report["effects"] == []
-    assert [(rival["name"], rival["joint"]) for rival in report["undecided"]] == [
-        ("dead_zone", 2),
-        ("torsional_spring", 1),
-    ]
-    assert "cannot tell what" in html
+    rivals = [("dead_zone", 2), ("torsional_spring", 1)]
+    assert [(rival["name"], rival["joint"]) for rival in report["undecided"]] == rivals
     assert [(each["name"], each["chance"]) for each in report["suspects"]] == [("motor_gain", 0.03)]
-    assert "<h2>Suspects" in html.replace(' id="suspects"', "") and "chance removes up to 3%" in html
+    assert "cannot tell what" in html and "<h2>Suspects" in html and "chance removes up to 3%" in html
 
 
 @pytest.mark.slow  # fast: sentences of findings, here
-def test_the_page_draws_what_is_left_beside_a_law(tmp_path):
-    diagnosis = _closed(SLIDE, _spring(1), _function("x", 1, 5.0))
-    logs = Logs(("a.csv", "b.csv"), _data(SLIDE), ("time", "u", "x"))
-    write_diagnosis(tmp_path, diagnosis, findings(diagnosis), logs, None, seed=0, began=0.0, log=lambda text: None)
-    html = (tmp_path / "report.html").read_text()
-    assert html.count("<figcaption><b>What is left of torsional spring at joint 1, a function of x.</b>") == 1
+def test_the_page_draws_the_longest_test_sequence_and_what_is_left_beside_a_law(tmp_path):
+    _, html = _written(tmp_path, _closed(SLIDE, _spring(1), _function("x", 1, 5.0)), True)
+    for caption in (
+        "What is left of torsional spring at joint 1, a function of x.",
+        "One test sequence.</b> The longest one (a.csv)",
+        *("Prediction error.", "Learned friction.", "The force that the declared model lacks.", "One-step errors."),
+    ):
+        assert html.count(f"<figcaption><b>{caption}") == 1

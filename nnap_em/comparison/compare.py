@@ -151,12 +151,12 @@ def _opened(fit: Path | str | Identified) -> Fit:
 
 def _labels(sources: Sequence[Path | str | Identified], opened: Sequence[Fit]) -> tuple[str, ...]:
     """Short names that differ: of the folder, else the paths as they are given, else numbers."""
-    paths = [None if isinstance(fit, Identified) else model_file(Path(fit)).absolute() for fit in sources]
-    short = [
-        fit.fitted.rig.name if path is None else path.parent.name if path.stem in ("model", "after") else path.stem
-        for path, fit in zip(paths, opened, strict=True)
-    ]
-    full = [name if isinstance(fit, Identified) else str(fit) for name, fit in zip(short, sources, strict=True)]
+    short, full = [], []
+    for source, fit in zip(sources, opened, strict=True):
+        path = None if isinstance(source, Identified) else model_file(Path(source)).absolute()
+        folder = path and (path.parent.name if path.stem in ("model", "after") else path.stem)
+        short.append(folder or fit.fitted.rig.name)
+        full.append(str(source) if folder else short[-1])
     numbered = [f"fit {i}" for i in range(1, len(short) + 1)]
     return tuple(next(labels for labels in (short, full, numbered) if len(set(labels)) == len(labels)))
 

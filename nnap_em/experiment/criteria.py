@@ -1,9 +1,11 @@
-"""Design criteria: costs of expected information, in units of a logarithm, so that costs can be added."""
+"""Design criteria: costs of expected information, in units of a logarithm, so that costs can be added.
+
+The smaller the `cost`, the better it is answered; one less is a factor e in a standard deviation.
+"""
 
 import math
-from abc import abstractmethod
+from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Float
@@ -41,15 +43,7 @@ def share(fit: Fit, logs: Float[np.ndarray, "phi phi"]) -> float:
     return 1.0 if wider(1.0) >= 0 or wider(1e-6) <= 0 else root_scalar(wider, bracket=(1e-6, 1.0)).root
 
 
-class AbstractCriterion(eqx.Module):
-    """A design criterion."""
-
-    @abstractmethod
-    def cost(self, expected: Information) -> Float[np.ndarray, "*proposal"]:
-        """The smaller, the better it is answered; one less is a factor e in a standard deviation."""
-
-
-class Friction(AbstractCriterion):
+class Friction(NamedTuple):
     """Width of the friction bands, the widest first: over all velocities, and once more near rest."""
 
     fit: Fit
@@ -67,13 +61,11 @@ class Friction(AbstractCriterion):
         return np.asarray(0.25 * np.mean(np.log(mean + 1e-30), axis=-1))
 
 
-class Parameters(AbstractCriterion):
-    """Uncertainty of some parameters: the mean of the logarithms of their standard deviations, in those of the
-    prior.
-    """
+class Parameters(NamedTuple):
+    """Mean logarithm of the standard deviations of some parameters, in those of the prior."""
 
     fit: Fit
-    places: tuple[int, ...] = eqx.field(static=True)
+    places: tuple[int, ...]
     """Among all parameters."""
 
     def cost(self, expected: Information) -> Float[np.ndarray, "*proposal"]:
@@ -83,10 +75,13 @@ class Parameters(AbstractCriterion):
         return np.asarray(0.5 * np.mean(np.log(variance), axis=-1))
 
 
-class Several(AbstractCriterion):
+class Several(NamedTuple):
     """More than one criterion, each as important."""
 
-    criteria: tuple[AbstractCriterion, ...]
+    criteria: tuple[Friction | Parameters, ...]
 
     def cost(self, expected: Information) -> Float[np.ndarray, "*proposal"]:
         return np.asarray(np.sum([q.cost(expected) for q in self.criteria], axis=0))
+
+
+Criterion = Friction | Parameters | Several

@@ -13,7 +13,7 @@ from ..fit.identify import Identified
 from ..fit.predict import drawn_paths, posterior_of
 from ..numerics.digits import counted
 from ..storage.log import Log, silent
-from .criteria import AbstractCriterion, Friction, Information, Parameters, Several, share, some
+from .criteria import Criterion, Friction, Information, Parameters, Several, share, some
 from .information import Fit, information, known
 from .limits import DesignError, Limits, limits_of
 from .play import allowed, motions
@@ -44,7 +44,7 @@ class Design(NamedTuple):
     """Information of all sequences."""
     old: Information
     """Information of as much time of the old inputs."""
-    question: AbstractCriterion
+    question: Criterion
     slow: Float[np.ndarray, " dof"]
     """Speed below which a fifth of the rows of the logs are: near rest [rad/s]."""
     friction_weight: Float[np.ndarray, "dof node"]
@@ -89,6 +89,12 @@ def design(
         DesignError: the rig has no input, a start is out of the limits, or nothing is open.
     """
     key_paths, key_noise, key_check, key_search = jax.random.split(key, 4)
+    check_question(question, fitted)
+    rows = round(seconds / sequences / fitted.rig.dt)
+    if rows < 20:
+        raise DesignError(
+            f"{counted(sequences, 'sequence')} in {seconds:g} s: {counted(rows, 'row')} each; give more --seconds"
+        )
     data = jax.device_put(data)
     posterior = posterior_of(fitted, data)
     path, used = np.asarray(posterior.state.mean), np.asarray(not_diverged(posterior, data))
@@ -99,11 +105,6 @@ def design(
     slow = np.maximum(slow, np.sort(np.abs(fit.nodes), axis=1)[:, 2])  # or up to the first nodes where it stood still
     friction = _friction(fit, visited, slow)
     criterion = _criterion(question, fitted, fit, friction)
-    rows = round(seconds / sequences / fitted.rig.dt)
-    if rows < 20:
-        raise DesignError(
-            f"{counted(sequences, 'sequence')} in {seconds:g} s: {counted(rows, 'row')} each; give more --seconds"
-        )
     t = fitted.rig.dt * np.arange(rows + 1)
     trial_models = 32  # models from the posterior by which every proposal is tried
     setup = Setup(fit, drawn_paths(fitted, trial_models, key=key_paths), limits, t, key_noise)
@@ -150,9 +151,8 @@ def check_question(name: str, fitted: Identified) -> None:
         raise DesignError(f"--for {name}: {why}; possible here: {names}")
 
 
-def _criterion(name: str, fitted: Identified, fit: Fit, friction: Friction) -> AbstractCriterion:
+def _criterion(name: str, fitted: Identified, fit: Fit, friction: Friction) -> Criterion:
     """The criterion of that name, or all of those that there are."""
-    check_question(name, fitted)
     prior, criteria = fitted.m_step.prior, {}
     if fitted.rig.friction:
         criteria["friction"] = friction

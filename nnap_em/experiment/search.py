@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, PRNGKeyArray
 from ..fit.predict import Paths
 from ..storage.journal import HERE, step
 from ..storage.log import Log, silent
-from .criteria import AbstractCriterion, Information, some
+from .criteria import Criterion, Information, some
 from .information import Fit, information
 from .limits import DesignError, Limits
 from .play import allowed, blank, motions
@@ -69,7 +69,7 @@ def evaluated(setup: Setup, proposal: Proposal, recorded: int) -> tuple[Bool[np.
 
 def search(
     setup: Setup,
-    criterion: AbstractCriterion,
+    criterion: Criterion,
     count: int,
     *,
     rng: np.random.Generator,
@@ -126,7 +126,7 @@ def _pool(setup: Setup, count: int, rng: np.random.Generator, effort: Effort, lo
 
 
 def _bettered(
-    setup: Setup, criterion: AbstractCriterion, plan: Plan, rng: np.random.Generator, reach: float, effort: Effort
+    setup: Setup, criterion: Criterion, plan: Plan, rng: np.random.Generator, reach: float, effort: Effort
 ) -> Plan:
     """Every sequence replaced by the best of some like it, where that is better."""
     count = len(plan.proposal.family)

@@ -1,70 +1,50 @@
 """Inputs that a machine can play: families of signals with free shapes, within limits of torque and of its change."""
 
-from abc import abstractmethod
 from typing import NamedTuple
 
-import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
 from .limits import Limits
 
-
-class AbstractSignal(eqx.Module):
-    """A family of signals."""
-
-    @abstractmethod
-    def __call__(self, z: Float[np.ndarray, " shape"], t: Float[np.ndarray, " time"]) -> Float[np.ndarray, " time"]:
-        """One of them, between -1 and 1, by numbers from 0 to 1."""
+Shape, Time = Float[np.ndarray, " shape"], Float[np.ndarray, " time"]
+"""Numbers from 0 to 1 that shape a signal, and rows of time [s] where it is between -1 and 1."""
 
 
-def _frequency(z, t):
-    """Frequency from one wave in the whole to the fastest, evenly in its logarithm [Hz]."""
-    fastest = 0.1  # highest frequency of a tone, in samples^-1: ten samples make a wave
-    slow, fast = 1.0 / (t[-1] - t[0]), fastest / (t[1] - t[0])
+def multisine(z: Shape, t: Time) -> Time:
+    """Five tones of free frequency, phase and size."""
+    tone, phase, size = z[:15].reshape(3, 5)
+    wave = np.sin(2 * np.pi * (_frequency(tone, t)[:, None] * t + phase[:, None]))
+    return np.clip(1.5 * size @ wave / size.sum(), -1.0, 1.0)
+
+
+def chirp(z: Shape, t: Time) -> Time:
+    """A tone whose frequency and size go from one value to another, about a level."""
+    share = (t - t[0]) / (t[-1] - t[0])
+    frequency = _frequency(z[0] + (z[1] - z[0]) * share, t)
+    size = z[2] + (z[3] - z[2]) * share
+    wave = np.sin(2 * np.pi * (np.cumsum(frequency) * (t[1] - t[0]) + z[4]))
+    return np.clip(size * wave + (2 * z[5] - 1) * (1 - size), -1.0, 1.0)
+
+
+def steps(z: Shape, t: Time) -> Time:
+    """Levels that are held in turn."""
+    place = np.minimum((z.size * (t - t[0]) / (t[-1] - t[0])).astype(int), z.size - 1)
+    return 2 * z[place] - 1
+
+
+def ramps(z: Shape, t: Time) -> Time:
+    """Straight lines between seven levels."""
+    return np.interp(t, np.linspace(t[0], t[-1], 7), 2 * z[:7] - 1)
+
+
+def _frequency(z: Shape, t: Time) -> Shape:
+    """Frequency from one wave in the whole to one in ten samples, evenly in its logarithm [Hz]."""
+    slow, fast = 1.0 / (t[-1] - t[0]), 0.1 / (t[1] - t[0])
     return slow * (fast / slow) ** z
 
 
-class Multisine(AbstractSignal):
-    """Tones of free frequency, phase and size."""
-
-    tones: int = eqx.field(static=True, default=5)
-
-    def __call__(self, z, t):
-        tone, phase, size = z[: 3 * self.tones].reshape(3, self.tones)
-        wave = np.sin(2 * np.pi * (_frequency(tone, t)[:, None] * t + phase[:, None]))
-        return np.clip(1.5 * size @ wave / size.sum(), -1.0, 1.0)
-
-
-class Chirp(AbstractSignal):
-    """A tone whose frequency and size go from one value to another, about a level."""
-
-    def __call__(self, z, t):
-        share = (t - t[0]) / (t[-1] - t[0])
-        frequency = _frequency(z[0] + (z[1] - z[0]) * share, t)
-        size = z[2] + (z[3] - z[2]) * share
-        wave = np.sin(2 * np.pi * (np.cumsum(frequency) * (t[1] - t[0]) + z[4]))
-        return np.clip(size * wave + (2 * z[5] - 1) * (1 - size), -1.0, 1.0)
-
-
-class Steps(AbstractSignal):
-    """Levels that are held in turn."""
-
-    def __call__(self, z, t):
-        place = np.minimum((z.size * (t - t[0]) / (t[-1] - t[0])).astype(int), z.size - 1)
-        return 2 * z[place] - 1
-
-
-class Ramps(AbstractSignal):
-    """Straight lines between a few levels."""
-
-    knots: int = eqx.field(static=True, default=7)
-
-    def __call__(self, z, t):
-        return np.interp(t, np.linspace(t[0], t[-1], self.knots), 2 * z[: self.knots] - 1)
-
-
-FAMILIES: tuple[AbstractSignal, ...] = (Multisine(), Chirp(), Steps(), Ramps())
+FAMILIES = (multisine, chirp, steps, ramps)
 
 
 class Proposal(NamedTuple):

@@ -8,7 +8,7 @@ from typing import Any
 from ..comparison.compare import CHANGED, Comparison, Quantity
 from ..numerics.digits import number, with_std
 from .document import versions
-from .page import rendered, write_report
+from .html import Table, rendered, section, write_report
 from .wording import p_value
 
 LEGEND = (
@@ -22,7 +22,8 @@ LEGEND = (
 def write_comparison(out: Path, comparison: Comparison) -> None:
     """Write compare.json and compare.html into the folder `out`."""
     document, (head, *lines) = describe(comparison), rows(comparison)
-    text = rendered("compare.html.j2", document=document, head=head, rows=lines, legend=LEGEND)
+    sections = [section("Read this first", comparison.warnings), section("All numbers", Table(head, lines), LEGEND)]
+    text = rendered("Comparison of", document, sections)
     write_report(out, "compare", document, text, comparison.fits[0].fitted.rig.named)
 
 

@@ -8,19 +8,20 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from ..data.formats import write_csv
 from ..diagnosis.keys import key_of, listed, words
 from ..diagnosis.residual import Names, names_of
-from ..experiment.criteria import Information, after
+from ..experiment.criteria import after
 from ..experiment.experiment import Design
 from ..numerics.digits import counted, number
 from ..storage.files import check_own
 from ..storage.log import Log
 from .document import versions
-from .page import Picture, picture, rendered, write_report
+from .html import Picture, Section, Table, picture, rendered, section, write_report
 from .style import AFTER, BEFORE, READING, ZERO_LINE, head, limits, panels, styled, symbol
 
 INPUT_DIR, MOTION_DIR = "inputs", "motion"
@@ -40,7 +41,7 @@ def write_design(out: Path, design: Design, *, question: str, seed: int, began: 
         "seconds": time.perf_counter() - began,
         "versions": versions(),
     }
-    text = rendered("design.html.j2", document=document, pictures=_pictures(design, document))
+    text = rendered("Next experiment for", document, _sections(document, design))
     write_report(out, "design", document, text, design.fitted.rig.named)
     log(document["verdict"])
     log(f"wrote {out / 'design.html'}, design.json and {counted(len(files), 'file')} in {out / INPUT_DIR}")
@@ -108,22 +109,19 @@ def describe(design: Design) -> dict[str, Any]:
     return document | {"verdict": _verdict(document)}
 
 
-def _sides(design: Design) -> dict[str, Information]:
-    """Uncertainty now, and after each of two experiments."""
-    return {"now": design.nothing, "expected": design.expected, "same_time_of_old_inputs": design.old}
+def _stds(design: Design) -> dict[str, Float[np.ndarray, " phi"]]:
+    """Standard deviations now, and after each of two experiments."""
+    cov = np.asarray(design.fit.cov)
+    sides = {"now": design.nothing, "expected": design.expected, "same_time_of_old_inputs": design.old}
+    return {side: np.sqrt(np.diagonal(after(cov, information))) for side, information in sides.items()}
 
 
 def friction_entries(design: Design) -> list[dict[str, Any]]:
     """Standard deviation of the friction of every joint over the velocities, now and after."""
-    nodes, cov = np.asarray(design.fit.nodes), np.asarray(design.fit.cov)
-    weight = design.friction_weight
-    stds = {
-        side: np.sqrt(np.diagonal(after(cov, info))[: nodes.size]).reshape(nodes.shape)
-        for side, info in _sides(design).items()
-    }
-    out = []
+    nodes, out = np.asarray(design.fit.nodes), []
+    stds = {side: std[: nodes.size].reshape(nodes.shape) for side, std in _stds(design).items()}
     for j, v in enumerate(nodes):
-        seen = weight[j] > 0
+        seen = design.friction_weight[j] > 0
         near = seen & (np.abs(v) <= design.slow[j])
         rms = {side: float(np.sqrt(np.mean(std[j][near] ** 2))) for side, std in stds.items()}
         curves = {"velocity": v[seen]} | {f"std_{side}": std[j][seen] for side, std in stds.items()}
@@ -136,10 +134,8 @@ def parameter_entries(design: Design) -> dict[str, dict[str, Any]]:
     prior, model = design.fit.prior, design.fit.model
     if not prior.size:
         return {}
-    cov, cut = np.asarray(design.fit.cov), design.fit.nodes.size
-    std = np.asarray(prior.std)
     value = np.asarray(prior.mean + prior.std * prior.read(model))
-    stds = {side: std * np.sqrt(np.diagonal(after(cov, info))[cut:]) for side, info in _sides(design).items()}
+    stds = {side: np.asarray(prior.std) * std[design.fit.nodes.size :] for side, std in _stds(design).items()}
     labels, units = [], []
     for name, place in zip(prior.names, prior.places(model), strict=True):
         whose, unit = name, design.fitted.rig.unit(name)
@@ -157,71 +153,108 @@ def parameter_entries(design: Design) -> dict[str, dict[str, Any]]:
 
 def _verdict(document: dict[str, Any]) -> str:
     """Use of the experiment, in one sentence."""
-    gains = []
-    if document["friction"]:
-        ratios = [
-            (
-                f["near_rest"]["now"] / f["near_rest"]["expected"],
-                f["near_rest"]["now"] / f["near_rest"]["same_time_of_old_inputs"],
-            )
-            for f in document["friction"]
-        ]
-        best, old = (listed([number(r[i], 2) for r in ratios]) for i in range(2))
-        joints = "joints " + listed([str(f["joint"]) for f in document["friction"]]) if len(ratios) > 1 else "the joint"
-        gains.append(
-            f"the friction band near rest of {joints} {best} times narrower (as much time of the old inputs: {old})"
-        )
+    gains, near = [], [entry["near_rest"] for entry in document["friction"]]
+    if near:
+        sides = ("expected", "same_time_of_old_inputs")
+        best, old = (listed([number(std["now"] / std[side], 2) for std in near]) for side in sides)
+        joints = f"joints {listed([str(f['joint']) for f in document['friction']])}" if len(near) > 1 else "the joint"
+        times = f"{best} times narrower (as much time of the old inputs: {old})"
+        gains.append(f"the friction band near rest of {joints} {times}")
     surer = {name: p["now"] / p["expected"] for name, p in document["parameters"].items() if p["expected"] > 0}
-    noted = 1.1  # factor of certainty from which on a parameter is named
-    told_most = sorted((name for name, times in surer.items() if times > noted), key=lambda name: -surer[name])
-    gains += [f"{name} {number(surer[name], 2)} times surer" for name in told_most[:3]]
+    named = sorted((name for name, times in surer.items() if times > 1.1), key=lambda name: -surer[name])
+    gains += [f"{name} {number(surer[name], 2)} times surer" for name in named[:3]]
     gains = gains or ["hardly anything surer: widen [limits], or give more --seconds"]
     what = f"{counted(document['sequences'], 'sequence')} of {number(document['seconds_each'])} s"
     return f"{what} should make {listed(gains)}."
 
 
-# --- in figures
+# --- as a page
 
 
-def _pictures(design: Design, document: dict[str, Any]) -> list[Picture]:
-    names, out = names_of(design.fitted), []
-    if document["friction"]:
+def _sections(document: dict[str, Any], design: Design) -> list[Section | None]:
+    names, friction = names_of(design.fitted), document["friction"]
+    bands, declared = [], document["limits"]["declared"]
+    if friction:
         caption = "Standard deviation of the learned friction: now, expected, and after as much time of the old inputs."
-        out.append(picture("found", "Friction bands", caption, bands_figure(document["friction"], names)))
+        bands = [picture("found", "Friction bands", caption, bands_figure(friction, names))]
+    known = [[f"friction of joint {f['joint']} near rest", "", *_gain(f["near_rest"])] for f in friction]
+    known += [[name, f"{number(p['value'])} {p['unit']}", *_gain(p)] for name, p in document["parameters"].items()]
+    states = [f"{name} [{document['units'][name]}]" for name in document["starts"][0]]
+    starts = [
+        [file, *map(number, start.values())] for file, start in zip(document["inputs"], document["starts"], strict=True)
+    ]
+    rate = document["limits"]["rate"]
+    limits = [
+        [f"{name} [{document['units'][name]}]", *map(number, pair), number(rate[name]) if name in rate else ""]
+        for name, pair in document["limits"]["values"].items()
+    ]
+    return [
+        section(
+            "What it will tell",
+            "Standard deviation of what is estimated: now, after as much time of the inputs that the logs of this fit "
+            "were made with, and after the designed ones. Near rest: root mean square over the slowest fifth of the "
+            "velocities that were visited.",
+            Table(["", "value", "now", "old inputs", "designed", "smaller by"], known),
+            *bands,
+        ),
+        section(
+            "What to play",
+            f"{document['sequences']} files, {document['inputs'][0]} and so on: time and inputs, each value held for "
+            f"{number(document['dt'])} s. Set the machine by hand where the sequence begins, let it come to rest, and "
+            "start the log with the first value. Put the logs beside the old ones: nnap-em diagnose OLD --more NEW "
+            "--out OUT.",
+            Table(["file", *states], starts),
+            *_motions(design, names),
+        ),
+        section(
+            "Limits",
+            "No sequence left these in 500 motions with models from the posterior, process noise and starts that are a "
+            "little off. "
+            + (f"Declared: {', '.join(declared)}; the others" if declared else "None is declared: they")
+            + " are the ranges of the logs. [limits] of rig.toml declares others.",
+            Table(["", "lowest", "highest", "change per second"], limits),
+        ),
+    ]
+
+
+def _gain(std: Mapping[str, float]) -> list[str]:
+    """Standard deviations now and after each experiment, and the factor of the designed one."""
+    sides = [std[side] for side in ("now", "same_time_of_old_inputs", "expected")]
+    return [*(number(side, 2) for side in sides), f"{number(sides[0] / sides[2], 2) if sides[2] > 0 else '–'} ×"]
+
+
+def _motions(design: Design, names: Names) -> list[Picture]:
+    caption = (
+        "Above what is to be played, below what the machine should do: the central 98 % of motions by models from the "
+        "posterior. Dashed: limits."
+    )
+    out = []
     for first in range(0, len(design.u), SEQUENCES_ACROSS):
         which = range(first, min(first + SEQUENCES_ACROSS, len(design.u)))
-        caption = (
-            "Above what is to be played, below what the machine should do: the central 98 % of motions by models from "
-            "the posterior. Dashed: limits."
-        )
         title = f"Sequences {which[0] + 1} to {which[-1] + 1}"
-        out.append(picture("error", title, caption, motion_figure(design, names, which)))
+        out.append(picture("found", title, caption, motion_figure(design, names, which)))
     return out
 
 
 @styled
 def bands_figure(friction: Sequence[Mapping[str, Any]], names: Names) -> Figure:
     """Standard deviation against velocity, a panel for each joint; `friction` as in design.json."""
-    figure = Figure(figsize=(max(4.4, 3.8 * min(len(friction), 4)), 3.4 * -(-len(friction) // 4)), layout="constrained")
-    (grid,) = panels(figure, len(friction))
-    sides = {
-        "std_now": (BEFORE, "now"),
-        "std_same_time_of_old_inputs": (READING, "old inputs"),
-        "std_expected": (AFTER, "designed"),
-    }
+    figure, (grid,) = panels(len(friction))
+    sides = (
+        ("now", BEFORE, "now"),
+        ("same_time_of_old_inputs", READING, "old inputs"),
+        ("expected", AFTER, "designed"),
+    )
     for ax, entry, rate in zip(grid, friction, names.rates, strict=True):
-        for side, (colour, label) in sides.items():
-            ax.plot(entry["velocity"], entry[side], color=colour, label=label)
-        ax.set_xscale("symlog", linthresh=entry["near_rest_below"])
-        ax.set_xticks([v for v in ax.get_xticks() if v == 0 or abs(v) >= entry["near_rest_below"]])
+        slow = entry["near_rest_below"]
+        for side, colour, label in sides:
+            ax.plot(entry["velocity"], entry[f"std_{side}"], color=colour, label=label)
+        ax.set_xscale("symlog", linthresh=slow)
+        ax.set_xticks([v for v in ax.get_xticks() if v == 0 or abs(v) >= slow])
         ax.set_yscale("log")
-        ax.axvspan(
-            -entry["near_rest_below"], entry["near_rest_below"], color="#F1F1F1", lw=0, zorder=0, label="near rest"
-        )
-        ax.set(
-            xlabel=f"velocity {symbol(rate)} [{names.unit(rate)}]",
-            ylabel=f"std of friction [{names.force_unit(entry['joint'])}]",
-        )
+        ax.axvspan(-slow, slow, color="#F1F1F1", lw=0, zorder=0, label="near rest")
+        ax.set_xlabel(f"velocity {symbol(rate)} [{names.unit(rate)}]")
+        ax.set_ylabel(f"std of friction [{names.force_unit(entry['joint'])}]")
         ax.set_title(names.joint(entry["joint"]).replace("j", "J", 1) if len(friction) > 1 else "")
     head(figure, "How well friction is known", list(grid))
     return figure
@@ -237,27 +270,22 @@ def motion_figure(design: Design, names: Names, which: Sequence[int]) -> Figure:
     for column, i in enumerate(which):
         for k, ax in enumerate(grid[: len(inputs), column]):
             ax.step(design.t, design.u[i, :, k], where="post", color=ZERO_LINE, label="to be played")
-            _fence(ax, design.limits.low[k], design.limits.high[k], [design.u[..., k]])
+            _within(ax, design.limits.low[k], design.limits.high[k], [design.u[..., k]])
         for s, ax in enumerate(grid[len(inputs) :, column]):
             low, middle, high = (band[i, :, s] for band in (design.low, design.middle, design.high))
             ax.fill_between(design.t, low, high, color=AFTER, alpha=0.25, lw=0, label="98 % of motions")
             ax.plot(design.t, middle, color=AFTER, label="expected")
-            _fence(ax, design.limits.lowest[s], design.limits.highest[s], [design.low[..., s], design.high[..., s]])
+            _within(ax, design.limits.lowest[s], design.limits.highest[s], [design.low[..., s], design.high[..., s]])
         grid[0, column].set_title(f"Sequence {i + 1}")
         grid[-1, column].set_xlabel("time [s]")
-    units = [names.force_unit(j) for j in design.fitted.model.system.joints] + [
-        names.unit(n) for n in (*states, *names.rates)
-    ]
-    for ax, name, unit in zip(grid[:, 0], (*inputs, *states, *names.rates), units, strict=True):
-        ax.set_ylabel(f"{symbol(name)} [{unit}]")
+    for ax, name in zip(grid[:, 0], (*inputs, *states, *names.rates), strict=True):
+        ax.set_ylabel(f"{symbol(name)} [{names.unit(name)}]")
     head(figure, "What to play, and what should happen", list(grid.ravel()))
     return figure
 
 
-def _fence(ax: Axes, low: float, high: float, shown: Sequence[Any]) -> None:
-    """Limits as lines, where they are near what is shown."""
-    bottom, top = limits(shown, 0.3)
+def _within(ax: Axes, low: float, high: float, shown: Sequence[Any]) -> None:
+    """Axis around what is shown, with the limits where they are in it."""
+    ax.set_ylim(*limits(shown, 0.3))
     for edge in (low, high):
-        if bottom <= edge <= top:
-            ax.axhline(edge, color=BEFORE, ls="--", lw=0.9, label="limit")
-    ax.set_ylim(bottom, top)
+        ax.axhline(edge, color=BEFORE, ls="--", lw=0.9, label="limit")

@@ -1,6 +1,6 @@
 """Everything that `nnap-em diagnose` leaves behind: report.json, report.html and tables."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,12 +18,13 @@ from ..diagnosis.residual import Names, Residual, names_of, residual
 from ..diagnosis.search import unbranched
 from ..fit.identify import FrictionTable, friction_table
 from ..fit.misfit import moved
-from ..fit.predict import GIVEN, Prediction
+from ..fit.predict import Prediction
 from ..numerics.profile import stage
 from ..storage.log import Log
 from .document import errors, noise, parameters, predictions, shared, visited
-from .fit_plots import effect_figure, error_figure, friction_figure, prediction_figure, screen_figure
-from .page import MOST_PICTURES, PICTURE_BYTES, Picture, picture, write_page
+from .fit_plots import effect_figure, error_figure, friction_figure, prediction_figure
+from .html import Picture, picture, write_report
+from .page import page
 from .residual_plots import innovation_figure, residual_figure
 from .tables import visited_nodes, write_friction
 
@@ -52,7 +53,6 @@ def write_diagnosis(
         error.setdefault("after", error["before"])
     searched = {name: fitted._replace(smoother=unbranched(fitted.bank)) for name, fitted in sides.items()}
     left = {name: residual(fitted, train.data) for name, fitted in searched.items()}
-    partial = left["after"].without_effects() if accepted else left["before"]
     tested = {name: tests(each, names) for name, each in left.items()}
     before, dof = left["before"], len(names.rates)
     followed = before.valid & before.used[:, None] & np.isfinite(before.state).all(axis=-1)
@@ -61,12 +61,10 @@ def write_diagnosis(
     tables = {n: friction_table(f, jnp.asarray(nodes)) for n, f in sides.items() if diagnosis.before.rig.friction}
     for name, table in tables.items():
         write_friction(out / f"friction_{name}.csv", *map(np.asarray, (table.velocity, table.torque, table.std)))
-    alone = lambda sides: sides if accepted else {"fit": sides["before"]} if sides else {}  # noqa: E731
     figures = [
-        *_error_pictures(error, alone(predicted), alone(tables), names, test),
-        *_residual_pictures(left, partial, names),
+        *_error_pictures(error, predicted, tables, names, test),
+        *_residual_pictures(left, names),
         *_effect_pictures(accepted),
-        *_search_pictures(diagnosis.steps, diagnosis.before.rig.named),
     ]
     rivals, suspects = undecided(diagnosis), suspected(diagnosis)
     failed = sum(t.p_value < 0.01 and not t.slight for t in tested["before"])
@@ -97,7 +95,7 @@ def write_diagnosis(
         "suspects": suspects,
         "next": [*advice(accepted, rivals, suspects), *designed],
     }
-    write_page(out, document, figures, diagnosis.before.rig.named)
+    write_report(out, "report", document, page(document, figures), diagnosis.before.rig.named)
     log(document["verdict"])
     log(f"wrote {out / 'report.html'} and report.json")
     return not misfit.useless
@@ -110,55 +108,35 @@ def _error_pictures(
     names: Names,
     test: Logs | None,
 ) -> list[Picture]:
-    """Pictures of prediction errors, of one prediction, and of the learned friction."""
+    """Pictures of prediction errors, of the learned friction, and of the prediction of the longest test sequence."""
+    alone = lambda sides: sides if "after" in sides else {"fit": sides["before"]}  # noqa: E731
     out = []
-    if error:
+    if error and test:
         caption = "On test sequences that no fit and no choice has seen."
-        if "fit" in predicted:
-            error = {key: value for key, value in error.items() if key != "after"}
-            error["fit"] = error.pop("before")
-        out.append(picture("error", "Prediction error", caption, error_figure(error, names)))
+        both = {name: error[name] for name in predicted}
+        figure = error_figure({name: error[name] for name in ("horizons_s", "reach_s")} | alone(both), names)
+        out.append(picture("error", "Prediction error", caption, figure))
     if tables:
         caption = "A missing effect bends the friction that is learned without it." if len(tables) > 1 else ""
-        out.append(
-            picture("error", "Learned friction", caption, friction_figure(tables, names, title="Learned friction"))
-        )
-    if test:
-        out += _prediction_pictures(predicted, names, test, error["given_s"] if error else GIVEN)
+        figure = friction_figure(alone(tables), names, title="Learned friction")
+        out.append(picture("error", "Learned friction", caption, figure))
+    if error and test:
+        longest, given = int(np.argmax(np.sum(np.asarray(test.data.valid), axis=1))), error["given_s"]
+        caption = f"The longest one ({test.files[longest]}), predicted from its first {given:g} s."
+        figure = prediction_figure(alone(predicted), test.data, names, given, longest)
+        out.append(picture("error", "One test sequence", caption, figure))
     return out
 
 
-def _prediction_pictures(predicted: Mapping[str, Prediction], names: Names, test: Logs, given: float) -> list[Picture]:
-    """Test sequences to choose from, the longest ones first; as many as there is room for."""
-    rows = np.sum(np.asarray(test.data.valid), axis=1)
-    out: list[Picture] = []
-    for i in sorted(range(len(rows)), key=lambda i: -rows[i])[:MOST_PICTURES]:
-        out.append(_prediction_picture(predicted, names, test, i, given))
-        if sum(len(picture.image) for picture in out) > PICTURE_BYTES and len(out) > 1:
-            out.pop()
-            break
-    return out if len(out) > 1 else [picture._replace(choice="") for picture in out]
-
-
-def _prediction_picture(
-    predicted: Mapping[str, Prediction], names: Names, test: Logs, number: int, given: float
-) -> Picture:
-    rows = np.asarray(test.data.valid[number])
-    sides = {n: (np.asarray(p.mean)[number][rows], np.asarray(p.std)[number][rows]) for n, p in predicted.items()}
-    t, y = (np.asarray(a[number])[rows] for a in (test.data.t, test.data.y))
-    caption = f"Predicted from its first {'second' if given == GIVEN else f'{given:g} s'} ({test.files[number]})."
-    figure = prediction_figure(t, y, names, sides, given)
-    return picture("error", "One test sequence", caption, figure, test.files[number])
-
-
-def _residual_pictures(left: Mapping[str, Residual], partial: Residual, names: Names) -> list[Picture]:
-    after, out = left.get("after"), []
+def _residual_pictures(left: Mapping[str, Residual], names: Names) -> list[Picture]:
+    before, after, out = left["before"], left.get("after"), []
     if names.coordinates:
         title = "The force that the declared model lacks"
         caption = "What the smoothed motion needs beyond the declared model, against everything that could cause it."
-        out.append(picture("residual", title, caption, residual_figure(partial, names, after)))
-    caption = "Left: the autocorrelation should stay within its bounds. Right: the quantiles should follow the line."
-    return [*out, picture("residual", "One-step errors", caption, innovation_figure(left["before"], names, after))]
+        lacking = after.without_effects() if after else before
+        out.append(picture("residual", title, caption, residual_figure(lacking, names, after)))
+    caption = "Their autocorrelation should stay within its bounds."
+    return [*out, picture("residual", "One-step errors", caption, innovation_figure(before, names, after))]
 
 
 def _effect_pictures(accepted: list[Finding]) -> list[Picture]:
@@ -172,18 +150,6 @@ def _effect_pictures(accepted: list[Finding]) -> list[Picture]:
             caption = "With its 90 % band, without its mean."
             out.append(picture("found", title, caption, effect_figure(finding.curve)))
     return out
-
-
-def _search_pictures(steps: tuple[Step, ...], named: Callable[[str], str]) -> list[Picture]:
-    steps = tuple(step for step in steps if step.screened)
-    if not steps:
-        return []
-    first = next((step for step in steps if step.accepted), steps[0])
-    chosen = named(words(first.accepted)) if first.accepted else None
-    entries = [(named(words(key)), score) for key, score in first.screened[:10]]
-    figure = screen_figure(entries, first.measure, chosen=chosen)
-    caption = f"Screening scores of the candidates, before any refit: {first.measure}."
-    return [picture("details", "The first screening round", caption, figure)]
 
 
 def _round(step: Step, dt: float) -> dict[str, Any]:

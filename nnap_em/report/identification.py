@@ -25,7 +25,8 @@ from ..storage.files import replace_bytes
 from ..storage.log import Log
 from .document import errors, friction_law, noise, parameters, predictions, shared, unknown_terms, visited
 from .fit_plots import error_figure, friction_figure, term_figure
-from .page import Picture, picture, write_page
+from .html import Picture, picture, write_report
+from .page import page
 from .tables import visited_nodes, write_friction
 from .wording import reached, sentence
 
@@ -93,7 +94,7 @@ def write_identification(
         "model": "model.npz",
     }
     _log_summary(document, log)
-    write_page(out, document, figures, fitted.rig.named)
+    write_report(out, "report", document, page(document, figures), fitted.rig.named)
     log(f"wrote {out / 'report.json'}" + ("" if test else f" ({document['error_note']})"))
     return not misfit.useless
 

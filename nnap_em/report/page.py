@@ -1,214 +1,266 @@
-"""The report as one page: a single HTML file without scripts that fetches nothing.
+"""Page of a fit or a diagnosis: what report.json beside it holds, in sentences, tables and figures."""
 
-`document` is what the JSON file beside it holds.  Each command has a template; parts.html.j2 has what they share.
-"""
-
-import base64
-import functools
-import io
-import itertools
-import re
-from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
-from typing import Any, Literal, NamedTuple
-
-import jinja2
-from matplotlib.figure import Figure
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
 
 from ..diagnosis.findings import growth
 from ..diagnosis.statistics import FAILS
 from ..effects import catalogue
-from ..numerics.digits import finite, number
-from ..storage.files import replace_own
-from . import wording
-from .tables import json_text
-from .wording import ratio, reached
+from ..numerics.digits import finite, number, with_std
+from .html import Part, Picture, Section, Table, rendered, section
+from .wording import label, p_value, quantity, ratio, reached, sentence, share
 
-Section = Literal["found", "error", "residual", "details"]
-"""Section of a page that a figure may stand in."""
-MOST_PICTURES, PICTURE_BYTES = 5, 900_000
-"""Pictures to choose from under one title, and bytes of all of them, at most; the first is always there."""
 _NATS = ((100, "Beyond doubt"), (30, "Very sure"), (10, "Sure"), (3, "Likely"))
-_TRUST = {
-    "share_of_error": ((0.6, "Very sure"), (0.3, "Sure"), (0.15, "Likely")),
-    "log_likelihood_gain": _NATS,
-}
-"""Thresholds of words: share of the error on recordings left out, log-likelihood [nat]; the first known
-decides, because nats are worth little where noise is not that of the
-model."""
-_PLACES = re.compile(rb'(?<=\s)(?:d|x|y)="[^"]*"')
-_DIGITS = re.compile(rb"(\.\d\d)\d+")
+_SHARES = ((0.6, "Very sure"), (0.3, "Sure"), (0.15, "Likely"))
+"""Thresholds of words for a log-likelihood [nat], and for a share of the error on recordings left out."""
 
-
-class Picture(NamedTuple):
-    """A figure of the page."""
-
-    title: str
-    caption: str
-    image: bytes
-    """SVG."""
-    place: Section = "residual"
-    choice: str = ""
-    """Name among the pictures of one title, of which the reader chooses one; empty: it stands alone."""
-    width: float = 0.0
-    """Width of the image [CSS px]; 0 where it is unknown."""
-
-    @property
-    def source(self) -> str:
-        """The image as an address that holds it."""
-        return f"data:image/svg+xml;base64,{base64.b64encode(self.image).decode('ascii')}"
-
-    @property
-    def style(self) -> str:
-        """About its own size; wide ones scroll inside their box on a phone."""
-        least = round(0.72 * self.width) if self.width > 560 else 0
-        return f"min-width:{least}px;max-width:{round(1.1 * self.width)}px" if self.width else ""
-
-
-def picture(place: Section, title: str, caption: str, figure: Figure, choice: str = "") -> Picture:
-    """A drawn figure for the page; paths and marks to a hundredth of a point: four fifths of the size."""
-    image = io.BytesIO()
-    figure.savefig(image, format="svg")
-    rounded = _PLACES.sub(lambda match: _DIGITS.sub(rb"\1", match[0]), image.getvalue())
-    return Picture(title, caption, rounded, place, choice, 96 * figure.get_size_inches()[0])
-
-
-def grouped(pictures: Sequence[Picture], place: str) -> list[list[Picture]]:
-    """Pictures of a section in their order; those to choose from share a list."""
-    section = [picture for picture in pictures if picture.place == place]
-    return [list(group) for _, group in itertools.groupby(section, lambda p: p.title if p.choice else id(p))]
-
-
-def write_report(
-    out: Path, kind: str, document: Mapping[str, Any], text: str, named: Callable[[str], str] = str
-) -> None:
-    """Write KIND.json and the page `text` as KIND.html into the folder `out`, in the names of the user's file."""
-    replace_own({out / f"{kind}.json": json_text(document, named), out / f"{kind}.html": named(text)})
-
-
-def write_page(
-    out: Path, document: Mapping[str, Any], pictures: Sequence[Picture], named: Callable[[str], str] = str
-) -> None:
-    """Write report.json and report.html."""
-    write_report(out, "report", document, page(document, pictures), named)
+HOLM = (
+    "A test fails where its p-value, the chance of such a result from a right model, corrected for the number of tests "
+    f"(Holm), is below {FAILS}. With many samples even a slight misfit is certain; the size says whether it matters."
+)
+_Entry = Mapping[str, Any]
 
 
 def page(document: Mapping[str, Any], pictures: Sequence[Picture] = ()) -> str:
     """Page of a fit or a diagnosis, whose document has no key `effects` or has one."""
-    error, effects = document.get("error") or {}, document.get("effects") or []
-    parameters = document.get("parameters") or {}
-    return rendered(
-        "report.html.j2",
-        document=document,
-        fitted="effects" not in document,
-        pictures=pictures,
-        effects=effects,
-        errors=[error.get("before") or error.get("fit") or {}, error.get("after") or {}],
-        tiles=_error_tiles(document) + _test_tiles(document),
-        horizons=reached(error),
-        failed=_failures(document.get("tests")),
-        doubted=_doubted(document),
-        parameters=parameters if {"before", "after"} & set(parameters) else {"fitted": parameters},
+    diagnosed, effects = "effects" in document, document.get("effects") or []
+    shown = {place: [one for one in pictures if one.place == place] for place in ("found", "error", "residual")}
+    numbers = _parameter_table(document)
+    learned = [[law["text"] for law in document.get("friction_law") or []], numbers]
+    title = "What was found, and how sure" if diagnosed else "What was learned"
+    sections = [
+        section(title, *(_found(document) if diagnosed else learned), *shown["found"]),
+        section("Before and after" if effects else "Prediction error", *_errors(document), *shown["error"]),
+        section("What the declared model leaves unexplained", *shown["residual"]),
+        section("External disturbances", *_disturbances(document.get("interventions"))),
+        section("What could not be told apart", *_equivalents(effects)),
+        section("What was not used of the logs", *_unused(document)),
+        section("Suspects", *_suspects(document.get("suspects"))),
+        section("What to measure next", document.get("next")),
+    ]
+    tests = document.get("tests") or {}
+    titles = {"before": "Declared model", "after": "With what was found"}
+    failed = [section(title, _failed(tests.get(side) or [])) for side, title in titles.items()]
+    details = [
+        section("Tests of the one-step errors that fail", HOLM if any(failed) else None, *failed, folded=True),
+        section("Screening rounds, in their order", *map(_round, document.get("rounds") or []), folded=True),
+        section("Estimated parameters", *([numbers, document.get("undetermined")] if diagnosed else []), folded=True),
+        section("Noise", _noise_table(document.get("noise") or {}), folded=True),
+    ]
+    return rendered("Diagnosis of" if diagnosed else "Identification of", document, sections, details)
+
+
+# --- what was found
+
+
+def _found(document: _Entry) -> list[Part | None]:
+    effects = document["effects"] or []
+    if effects:
+        grows = growth(document.get("error") or {})
+        doubted = bool(grows) and sum(grows.values()) >= 0  # in the geometric mean of the columns
+        nats = any(finite((effect.get("evidence") or {}).get("log_likelihood_gain")) for effect in effects)
+        unit = "nat: the unit of log-likelihood; every 2.3 nat make the data ten times as likely. " * nats
+        return [*(_effect(effect, doubted) for effect in effects), f"{unit}±: one standard deviation."]
+    if document.get("suspects"):
+        return ["No effect is added to the model. Some laws are suspected."]
+    if document.get("complete") is False:
+        return ["No effect is added to the model so far: the search was not finished."]
+    return [
+        "No effect of the catalogue, and no unknown force, improves the model by more than chance would. "
+        "Weaker effects than these data can show are not excluded."
+    ]
+
+
+def _effect(effect: _Entry, doubted: bool) -> Section | None:
+    """An effect with its meaning, its parameters and what was measured about it."""
+    law, description = catalogue.get(effect.get("name") or ""), effect.get("description") or ""
+    meaning, words = (law.meaning, law.words) if law else ("", {})
+    only_numbers = (
+        "±" in description and meaning and not effect.get("shape") and effect.get("name") != "unknown_function"
     )
+    rows = [
+        [f"{words[key]} ({key})" if words.get(key, key) != key else key, quantity(entry)]
+        for key, entry in (effect.get("parameters") or {}).items()
+    ]
+    evidence = " ".join(_evidence(effect.get("evidence") or {}, doubted))
+    text = "" if only_numbers else sentence(description)
+    return section(sentence(label(effect))[:-1], meaning, text, Table([], rows), evidence)
 
 
-def rendered(template: str, **content: Any) -> str:
-    """A template of this folder, filled in."""
-    return _environment().get_template(template).render(**content)
-
-
-@functools.cache
-def _environment() -> jinja2.Environment:
-    """Templates that escape all text, with the words of a report as filters."""
-    loader = jinja2.PackageLoader("nnap_em", "report")
-    environment = jinja2.Environment(
-        loader=loader, autoescape=True, undefined=jinja2.ChainableUndefined, trim_blocks=True, lstrip_blocks=True
-    )
-    environment.filters["grouped"] = grouped
-    names = ("number", "with_std", "quantity", "p_value", "label", "sentence", "share")
-    environment.filters |= {name: getattr(wording, name) for name in names} | {"trust": _trust, "highest": _highest}
-    environment.tests |= {"finite": finite, "failed": _fails}
-    environment.globals |= {"most": MOST_PICTURES, "catalogue": catalogue, "level": FAILS, "at": _at, "ratio": ratio}
-    return environment
-
-
-# --- what is worked out of the document
-
-
-def _error_tiles(document: Mapping[str, Any]) -> list[tuple[str, str, str]]:
-    """Title, number and remark of the errors about 1 s ahead, of the two columns that change most by the effects."""
-    error, units = document.get("error") or {}, document.get("units") or {}
-    horizons, after = reached(error), error.get("after") or {}
-    grows, tiles = growth(error) if document.get("effects") else {}, []
-    columns = (error.get("before") or error.get("fit") or {}).items()
-    for column, values in sorted(columns, key=lambda entry: -abs(grows.get(entry[0], 0.0)))[:2]:
-        if not horizons:
+def _evidence(evidence: _Entry, doubted: bool) -> Iterable[str]:
+    """Certainty in words, by the share of the error where it is known, for nats are worth little where noise is not
+    that of the model; then the numbers.
+    """
+    gain, removed, chance = (evidence.get(name) for name in ("log_likelihood_gain", "share_of_error", "chance"))
+    for value, scale in ((removed, _SHARES), (gain, _NATS)):
+        if finite(value):
+            word = next((word for least, word in scale if value >= least), "A hint only")  # type: ignore[operator]
+            yield "Doubtful: the test sequences are predicted no better with it." if doubted else f"{word}."
             break
-        place = min(range(len(horizons)), key=lambda i: abs(horizons[i] - 1.0))
-        first, last, unit = _at(values, place), _at(after.get(column), place), units.get(column) or ""
-        title = f"error of {column}, {horizons[place]:.3g} s ahead"
-        if document.get("effects"):
-            times = ratio(first, last)
-            change = f"{number(first, 2)} → {number(last, 2)} {unit}"
-            tiles.append((title, change, f"{times} smaller" if times.endswith("×") else times))
-        else:
-            tiles.append((title, f"{number(first, 2)} {unit}", "on test sequences"))
-    return tiles
+    if finite(gain):
+        yield f"It raises the log-likelihood of the training data by {number(gain)} nat."
+    if finite(removed):
+        parts = evidence.get("parts")
+        where = f", on {parts[0]} of {parts[1]} parts of them" if parts else ""
+        yield f"On recordings left out of its fit it removes {share(removed)}{where}."  # type: ignore[arg-type]
+    if finite(chance):
+        least = f"up to {number(100 * chance, 2)} %" if chance >= 0.005 else "less than 1 %"  # type: ignore[operator]
+        yield f"Columns shifted in time remove {least}."
 
 
-def _test_tiles(document: Mapping[str, Any]) -> list[tuple[str, str, str]]:
-    failed = _failures(document.get("tests"))
-    if failed is None:
+def _equivalents(effects: Sequence[_Entry]) -> list[Part]:
+    same = [
+        f"{sentence(label(effect))[:-1]}: the data cannot tell it from {' or '.join(map(label, effect['equivalent']))}."
+        for effect in effects
+        if effect.get("equivalent")
+    ]
+    return [same or "Nothing: no other effect that was tried explains these data nearly as well."] if effects else []
+
+
+def _suspects(suspects: Sequence[_Entry] | None) -> list[Part]:
+    if not suspects:
         return []
-    text = str(failed.before) if failed.after is None else f"{failed.before} → {failed.after}"
-    return [("failed tests of one-step errors", text, f"of {failed.total}; a right model fails none")]
+    return [
+        "These laws remove more of the prediction error than chance does on these recordings. They were not accepted "
+        "and are not in the model. Chance is measured on the same laws with their columns shifted in time.",
+        [each["description"] for each in suspects],
+    ]
 
 
-def _at(values: Any, place: int) -> Any:
-    return values[place] if values and place < len(values) else None
+# --- errors
 
 
-class _Failed(NamedTuple):
-    """Numbers of tests that failed before and after (None: there is no after), and of those that failed by little."""
+def _errors(document: _Entry) -> list[Part]:
+    """Errors of the predictions by horizon and column, and tests of the one-step errors that fail."""
+    error, units = document.get("error") or {}, document.get("units") or {}
+    before, after = error.get("before") or error.get("fit") or {}, error.get("after") or {}
+    both, horizons, out = bool(document.get("effects")), reached(error), []
+    if before and horizons:
+        given = f"the first {number(error['given_s'], 2)} s" if finite(error.get("given_s")) else "the start"
+        what = ": before → after, and how many times smaller it is" * both
+        out.append(
+            f"Each test sequence is predicted from {given} of its readings, without looking at the rest. The error is "
+            f"the root mean square of prediction minus reading, up to the time ahead{what}. Test sequences had no part "
+            "in any choice."
+        )
+        head = ["time ahead", *(f"{column} [{units[column]}]" if units.get(column) else column for column in before)]
+        rows = [
+            [f"{number(horizon, 2)} s", *(_change(before[c][i], after[c][i] if both else None) for c in before)]
+            for i, horizon in enumerate(horizons)
+        ]
+        out.append(Table(head, rows))
+    tests = document.get("tests") or {}
+    if tests.get("before"):
+        out.append(_failures(tests["before"], tests.get("after")))
+    return [*out, document["friction_change"]] if document.get("friction_change") else out
 
-    total: int
-    before: int
-    after: int | None
-    slight_before: int
-    slight_after: int
+
+def _change(before: Any, after: Any) -> str:
+    if after is None or not finite(before):
+        return number(before)
+    return f"{number(before)} → {number(after)} ({ratio(before, after)})"
 
 
-def _failures(tests: Any) -> _Failed | None:
-    if not (tests and tests.get("before")):
-        return None
-    sides = [[t for t in tests.get(side) or [] if _fails(t)] for side in ("before", "after")]
-    slight = [sum(bool(t.get("slight")) for t in side) for side in sides]
-    first, last = (len(side) - little for side, little in zip(sides, slight, strict=True))
-    return _Failed(len(tests["before"]), first, last if tests.get("after") else None, *slight)
+def _failures(before: Sequence[_Entry], after: Sequence[_Entry] | None) -> str:
+    """Numbers of tests that fail, without those that fail by little."""
+    sides = {"before": before, "after": after} if after else {"": before}
+    counts = {side: sum(_fails(test) and not test.get("slight") for test in tests) for side, tests in sides.items()}
+    texts = " and ".join(f"{count or 'none'} {side}".strip() for side, count in counts.items())
+    return (
+        f"Of {len(before)} tests that the errors from one sample to the next are pure noise, {texts} fail by more than "
+        "a little."
+    )
 
 
-def _fails(test: Mapping[str, Any]) -> bool:
+def _fails(test: _Entry) -> bool:
     p = test.get("p_value")
     return finite(p) and p < FAILS  # type: ignore[operator]
 
 
-def _doubted(document: Mapping[str, Any]) -> bool:
-    """True where the test error 1 s ahead does not fall with the accepted effects, in the geometric mean of columns."""
-    grows = growth(document.get("error") or {}) if document.get("effects") else {}
-    return bool(grows) and sum(grows.values()) >= 0
+def _failed(tests: Sequence[_Entry]) -> Table:
+    """The tests that fail, surest first."""
+    rows = [
+        [t["channel"] or "", t["name"] + " (slightly)" * bool(t.get("slight")), number(t["size"], 2),
+         p_value(t["p_value"]), t["meaning"]]
+        for t in sorted(filter(_fails, tests), key=lambda test: test["p_value"])
+    ]  # fmt: skip
+    return Table(["column", "test", "size", "p-value", "in words"], rows, "left")
 
 
-def _trust(evidence: Mapping[str, Any] | None, doubted: bool) -> str:
-    """Certainty of the finding in words; empty where it is unknown."""
-    rows = ((name, scale, (evidence or {}).get(name)) for name, scale in _TRUST.items())
-    decisive = next(((scale, value) for _, scale, value in rows if finite(value)), None)
-    if decisive is None:
-        return ""
-    if doubted:
-        return "Doubtful: the test sequences are predicted no better with it"
-    return next((word for least, word in decisive[0] if decisive[1] >= least), "A hint only")
+# --- the logs and the search
 
 
-def _highest(entries: Sequence[Mapping[str, Any]] | None) -> list[Mapping[str, Any]]:
-    """The eight entries of highest score, highest first."""
-    return sorted(entries or [], key=lambda entry: -(entry.get("gain") or 0.0))[:8]
+def _disturbances(entries: Sequence[_Entry] | None) -> list[Part]:
+    if not entries:
+        return []
+    rows = [
+        [f"train/{e['file']}", str(e["joint"]), f"{number(e['from'], 4)} s", f"{number(e['to'], 4)} s",
+         f"{with_std(e['size'], e['std'])} {e['unit']}"]
+        for e in entries
+    ]  # fmt: skip
+    return [
+        "At these moments something pushed that no law explains: a hand, a collision, a cable that caught, or a "
+        "disturbance that is not in the log. No other recording shows such a force in the same state. What the machine "
+        "does by itself should not stand here; record such a motion twice, and it will not.",
+        Table(["file", "joint", "from", "to", "size"], rows, "left"),
+    ]
+
+
+def _unused(document: _Entry) -> list[Part]:
+    out: list[Part] = []
+    if document.get("left_out"):
+        out.append(f"Diverged, and left out of the last epoch: {', '.join(document['left_out'])}.")
+    if masked := document.get("masked"):
+        rows = [
+            [f"{e['part']}/{e['file']}", e["column"] or "all", e["kind"], str(e["amount"]), f"{number(e['time'], 4)} s"]
+            for e in masked
+        ]
+        out += [
+            "These readings were taken as missing: they are far from what the rows around them say, or their sensor "
+            "stood still while the machine moved. gap: rows that the log lost; cut: rows after a gap that nothing "
+            "could bridge. Errors of prediction are against all readings of the test files. --trust-readings uses the "
+            "readings as they are.",
+            Table(["file", "column", "what", "how many", "first at"], rows, "left"),
+        ]
+    return out
+
+
+def _round(entry: _Entry) -> Section | None:
+    """Scores of a screening round and of its refits, the eight highest."""
+    columns = (("screened", entry.get("measure") or "expected gain [nat]"), ("refitted", "after a refit"))
+    tables = []
+    for name, measure in columns:
+        best = sorted(entry.get(name) or [], key=lambda each: -(each.get("gain") or 0.0))[:8]
+        tables.append(Table(["effect", measure], [[label(each), number(each["gain"])] for each in best]))
+    untried = f"{entry['untried']} more candidates over their bar were not tried." if entry.get("untried") else ""
+    return section(f"Over {number(entry['horizon_s'])} s: added {entry['accepted'] or 'nothing'}", untried, *tables)
+
+
+# --- numbers
+
+
+def _parameter_table(document: _Entry) -> Table:
+    sides = _sides(document.get("parameters") or {})
+    rows = [
+        [name, *(quantity(side[name]) if name in side else "–" for side in sides.values())]
+        for name in dict.fromkeys(name for side in sides.values() for name in side)
+    ]
+    return Table(["parameter", *sides], rows)
+
+
+def _noise_table(noise: _Entry) -> Table:
+    sides, rows = _sides(noise), []
+    for kind, title in (("measurement", "reading"), ("process_per_step", "process per step,")):
+        for name in next(iter(sides.values()), {}).get(kind, {}):
+            entries = [side[kind].get(name) for side in sides.values()]
+            rows.append([f"{title} {name}", *(_std(entry) if entry else "–" for entry in entries)])
+    return Table(["standard deviation", *sides], rows)
+
+
+def _std(entry: _Entry) -> str:
+    return f"{number(entry['std'])} {entry['unit']}" + " (estimated)" * bool(entry.get("estimated"))
+
+
+def _sides(entries: _Entry) -> _Entry:
+    """Numbers before and after, of a fit one side of them."""
+    return entries if "before" in entries else {"fitted": entries} if entries else {}

@@ -3,8 +3,8 @@
 Figures belong to nobody; save one with `savefig`.
 """
 
-from collections.abc import Callable, Sequence
-from typing import Any, ParamSpec
+from collections.abc import Mapping, Sequence
+from typing import Any, TypeVar
 
 import numpy as np
 from jaxtyping import Float
@@ -37,20 +37,9 @@ STYLE: Any = {
     "savefig.dpi": 150,
     "figure.dpi": 150,
 }
-
-
-_Arguments = ParamSpec("_Arguments")
-
-
-def styled(draw: Callable[_Arguments, Figure]) -> Callable[_Arguments, Figure]:
-    """A function that draws in this style."""
-
-    def wrapped(*args: _Arguments.args, **kwargs: _Arguments.kwargs) -> Figure:
-        with rc_context(STYLE):
-            return draw(*args, **kwargs)
-
-    wrapped.__name__, wrapped.__doc__ = draw.__name__, draw.__doc__
-    return wrapped
+_Side = TypeVar("_Side")
+styled = rc_context(STYLE)
+"""Decorator of a function that draws in this style."""
 
 
 def symbol(name: str) -> str:
@@ -62,31 +51,15 @@ def symbol(name: str) -> str:
 
 
 def head(figure: Figure, title: str, axes: Sequence[Axes], note: str = "") -> None:
-    """Title, note and one legend for all panels, above them and in a column each."""
+    """Title and note above all panels, one legend for them below."""
     seen: dict[str, Any] = {}
     for ax in axes:
         for handle, label in zip(*ax.get_legend_handles_labels(), strict=True):
             seen.setdefault(label, handle)
-    width, height = figure.get_size_inches()
-    columns = min(len(seen), max(1, int(width / 1.3)))
-    rows = -(-len(seen) // max(columns, 1))
-    top = 0.30 + 0.17 * (note.count("\n") + 1) * bool(note)
-    figure.text(0.08 / width, 1 - 0.08 / height, title, va="top", ha="left", fontsize=11, weight="bold")
-    if note:
-        figure.text(0.08 / width, 1 - 0.30 / height, note, va="top", ha="left", color="#555555", fontsize=8.5)
+    figure.suptitle(f"{title}\n{note}" if note else title, x=0.02, ha="left", fontsize=10)
     if seen:
-        figure.legend(
-            seen.values(),
-            seen.keys(),
-            loc="upper left",
-            ncols=columns,
-            bbox_to_anchor=(0.0, 1 - top / height),
-            borderaxespad=0.2,
-            columnspacing=1.4,
-            handlelength=1.6,
-            markerscale=4,
-        )
-    figure.get_layout_engine().set(rect=(0, 0, 1, 1 - (top + 0.05 + 0.21 * rows) / height))  # type: ignore[union-attr]
+        columns = min(len(seen), max(1, int(figure.get_size_inches()[0] / 1.6)))
+        figure.legend(seen.values(), seen.keys(), loc="outside lower left", ncols=columns, markerscale=4)
 
 
 def density(ax: Axes, visited: Float[Any, " sample"], low: float, high: float) -> None:
@@ -123,12 +96,18 @@ def dotted(ax: Axes, x: Any, y: Any, colour: str, label: str, mark: str = "o") -
     ax.plot(x, y, mark, color=colour, ms=3)
 
 
-def panels(figure: Figure, count: int, heights: Sequence[float] = (1.0,)) -> np.ndarray:
-    """Axes [part, panel] of `count` panels, `ACROSS` side by side, each of parts of these heights below each other."""
+def coloured(sides: Mapping[str, _Side]) -> list[tuple[str, _Side, str]]:
+    """Name, content and colour of one side or two, the last one in blue."""
+    return [(*side, colour) for side, colour in zip(sides.items(), (BEFORE, AFTER)[-len(sides) :], strict=True)]
+
+
+def panels(count: int, heights: Sequence[float] = (1.0,)) -> tuple[Figure, np.ndarray]:
+    """A figure, and axes [part, panel] of `count` panels, `ACROSS` side by side, each of parts of these heights."""
     across, parts = min(count, ACROSS), len(heights)
     deep = -(-count // across)
+    figure = Figure(figsize=(max(4.4, (3.6 if across < 3 else 2.9) * across), 0.7 + 2.9 * deep), layout="constrained")
     grid = figure.subplots(deep * parts, across, squeeze=False, height_ratios=list(heights) * deep)
     grid = grid.reshape(deep, parts, across).swapaxes(0, 1).reshape(parts, -1)
     for ax in grid[:, count:].ravel():
         ax.set_axis_off()
-    return grid[:, :count]
+    return figure, grid[:, :count]

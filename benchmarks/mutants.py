@@ -162,7 +162,7 @@ rows of a block left out
 - reshape(count * size, *a.shape[2:])[:length]
 + reshape(count * size, *a.shape[2:])[-length:]
 # numerics/traced.py
-## test_traced.py::test_another_text_of_the_package_makes_another
+## test_traced.py::test_what_decides_a_program_makes_another[text of the package]
 a kept program whatever the package says now
 - digest(surroundings(), function,
 + digest(function,

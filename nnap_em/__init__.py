@@ -29,69 +29,37 @@ if TYPE_CHECKING:
     from .systems import read_rig, register, register_equations
 
 __all__ = [
-    "Dataset",
-    "Diagnosis",
-    "Identified",
-    "Rig",
-    "__version__",
-    "check",
-    "compare",
-    "design",
-    "diagnose",
-    "errors",
-    "export",
-    "findings",
-    "friction_table",
-    "horizon_errors",
-    "identify",
-    "identify_from",
-    "load",
-    "observer",
-    "pad",
-    "paper",
-    "parallel",
-    "parameter_table",
-    "plots",
-    "predict",
-    "read_logs",
-    "read_rig",
-    "register",
-    "register_equations",
-    "results",
-    "save",
-    "simulate",
-    "smooth",
-    "smoothers",
-    "systems",
-    "write_rig",
-]
+    "Dataset", "Diagnosis", "Identified", "Rig", "__version__", "check", "compare", "design", "diagnose", "errors",
+    "export", "findings", "friction_table", "horizon_errors", "identify", "identify_from", "load", "observer", "pad",
+    "paper", "parallel", "parameter_table", "plots", "predict", "read_logs", "read_rig", "register",
+    "register_equations", "results", "save", "simulate", "smooth", "smoothers", "systems", "write_rig",
+]  # fmt: skip
 _homes = {
-    "comparison.compare": ("compare",),
-    "data.dataset": ("Dataset", "pad"),
-    "data.logs": ("read_logs",),
-    "data.rig": ("Rig", "write_rig"),
-    "diagnosis.findings": ("findings",),
-    "diagnosis.outcome": ("Diagnosis",),
-    "diagnosis.search": ("diagnose",),
-    "experiment.experiment": ("design",),
-    "fit.identify": ("Identified", "friction_table", "identify", "parameter_table"),
-    "fit.known": ("identify_from",),
-    "fit.observer": ("observer",),
-    "fit.predict": ("horizon_errors", "predict", "smooth"),
-    "fit.store": ("load", "save"),
-    "fit.check": ("check",),
-    "model.simulate": ("simulate",),
-    "systems": ("read_rig", "register", "register_equations"),
+    "comparison.compare": "compare",
+    "data.dataset": "Dataset pad",
+    "data.logs": "read_logs",
+    "data.rig": "Rig write_rig",
+    "diagnosis.findings": "findings",
+    "diagnosis.outcome": "Diagnosis",
+    "diagnosis.search": "diagnose",
+    "experiment.experiment": "design",
+    "fit.check": "check",
+    "fit.identify": "Identified friction_table identify parameter_table",
+    "fit.known": "identify_from",
+    "fit.observer": "observer",
+    "fit.predict": "horizon_errors predict smooth",
+    "fit.store": "load save",
+    "model.simulate": "simulate",
+    "systems": "read_rig register register_equations",
 }
-_home = {name: home for home, names in _homes.items() for name in names}
-_namespaces = ("errors", "export", "paper", "parallel", "plots", "results", "smoothers", "systems")
+_home = {name: home for home, names in _homes.items() for name in names.split()}
 
 
 def __getattr__(name: str) -> Any:
-    if name in _namespaces:
-        return importlib.import_module(f"{__name__}.{name}")
-    if name not in _home:
+    if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    if name not in _home:
+        return importlib.import_module(f"{__name__}.{name}")
     value = getattr(importlib.import_module(f"{__name__}.{_home[name]}"), name)
     globals()[name] = value
     return value

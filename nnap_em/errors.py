@@ -9,18 +9,5 @@ from .experiment.limits import DesignError
 from .export.model import ExportError
 from .storage.files import StoreError
 
-__all__ = [
-    "CompareError",
-    "DataError",
-    "DataWarning",
-    "DesignError",
-    "ExportError",
-    "FitError",
-    "RigError",
-    "RigWarning",
-    "StoreError",
-]
-
-
-def __dir__() -> list[str]:
-    return __all__
+__all__ = ["CompareError", "DataError", "DataWarning", "DesignError", "ExportError", "FitError", "RigError"]
+__all__ += ["RigWarning", "StoreError"]

@@ -5,17 +5,5 @@ from .model.friction import FrictionNetwork
 from .model.simulate import Experiment, examples, paper_experiment, paper_model
 from .model.state_space import StateSpaceModel
 
-__all__ = [
-    "EMState",
-    "Experiment",
-    "FrictionNetwork",
-    "Schedule",
-    "StateSpaceModel",
-    "examples",
-    "paper_experiment",
-    "paper_model",
-]
-
-
-def __dir__() -> list[str]:
-    return __all__
+__all__ = ["EMState", "Experiment", "FrictionNetwork", "Schedule", "StateSpaceModel"]
+__all__ += ["examples", "paper_experiment", "paper_model"]

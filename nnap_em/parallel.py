@@ -3,7 +3,3 @@
 from .numerics.parallel import all_devices, over
 
 __all__ = ["all_devices", "over"]
-
-
-def __dir__() -> list[str]:
-    return __all__

@@ -11,7 +11,3 @@ from .fit.predict import Prediction
 
 __all__ = ["CheckResult", "Comparison", "Design", "Finding", "FrictionTable", "Logs"]
 __all__ += ["Observation", "Observer", "Prediction"]
-
-
-def __dir__() -> list[str]:
-    return __all__

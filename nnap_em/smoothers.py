@@ -9,16 +9,5 @@ from .smoother.mixture import MixtureSmoother
 from .smoother.particle import ParticleSmoother
 from .smoother.posterior import Posterior
 
-__all__ = [
-    "Branch",
-    "CubatureSmoother",
-    "ExtendedKalmanSmoother",
-    "MixtureSmoother",
-    "ParticleSmoother",
-    "Posterior",
-    "branches",
-]
-
-
-def __dir__() -> list[str]:
-    return __all__
+__all__ = ["Branch", "CubatureSmoother", "ExtendedKalmanSmoother", "MixtureSmoother", "ParticleSmoother"]
+__all__ += ["Posterior", "branches"]

@@ -4,7 +4,6 @@ The blocks of a page share one folder and one namespace.  `<!-- not run: reason 
 """
 
 import ast
-import importlib
 import re
 import shlex
 import sys
@@ -14,7 +13,6 @@ from typing import NamedTuple
 
 import pytest
 
-import nnap_em
 from nnap_em.commands import cli
 from nnap_em.data.rig import read_rig
 from nnap_em.effects import catalogue
@@ -22,7 +20,6 @@ from nnap_em.systems import register, specs, systems
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
-FOLDERS = sorted(path.parent for path in (ROOT / "nnap_em").glob("*/__init__.py"))
 _BLOCK = re.compile(r"(?:^<!-- not run:(?P<reason>.*?)-->\n)?^```(?P<kind>.*)\n(?P<text>(?:.*\n)*?)```$", re.MULTILINE)
 
 
@@ -105,13 +102,3 @@ def test_a_name_that_is_taken_is_refused(registries):
     register("slide", systems["slide"])
     with pytest.raises(ValueError, match="is the name of Slide"):
         register("slide", systems["pendulum"])
-
-
-def test_reference_has_every_public_name():
-    listed = re.findall(r"^::: (nnap_em\.[\w.]+)\.(\w+)$", (ROOT / "docs/api.md").read_text(), re.MULTILINE)
-    there = [getattr(importlib.import_module(home), name) for home, name in listed]
-    top = [getattr(nnap_em, name) for name in nnap_em.__all__ if name != "__version__"]
-    rooms = [value for value in top if isinstance(value, ModuleType)]
-    public = [value for value in top if value not in rooms] + [getattr(r, name) for r in rooms for name in r.__all__]
-    assert {id(value) for value in there} == {id(value) for value in public}
-    assert len({id(value) for value in there}) == len(there)

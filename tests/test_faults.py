@@ -15,7 +15,6 @@ import signal
 import subprocess
 import sys
 import time
-import types
 from pathlib import Path
 
 import jax
@@ -29,7 +28,6 @@ from shell import ENVIRONMENT
 
 from nnap_em.commands import check as check_command
 from nnap_em.commands import cli
-from nnap_em.commands import diagnose as diagnose_command
 from nnap_em.commands import identify as identify_command
 from nnap_em.commands.identify import MISFIT_STATUS
 from nnap_em.data.logs import read_logs
@@ -37,13 +35,11 @@ from nnap_em.data.rig import read_rig
 from nnap_em.effects import catalogue
 from nnap_em.numerics.digest import digest
 from nnap_em.storage import files, journal
-from nnap_em.storage.files import sweep
 from nnap_em.storage.journal import HERE, Journal, keeping, step
 from nnap_em.systems import specs
 
 SPRING = {"name": "torsional_spring", "joint": 1, "k": 20.0, "theta0": 0.05}
 SLIDE = plant.Case(system="slide", sequences=8, tests=1, steps=95, seed=2, noise=(5e-4, 5e-3), effects=(SPRING,))
-IDENTIFY, DIAGNOSE = ("identify", "--epochs", "14"), ("diagnose",)
 
 
 @pytest.fixture(scope="module")
@@ -54,8 +50,8 @@ def rig(tmp_path_factory) -> Path:
     return folder
 
 
-def _order(command, rig: Path, out: Path, *more) -> list[str]:
-    return [command[0], str(rig), "--out", str(out), *command[1:], *more]
+def _order(command: str, rig: Path, out: Path, *more: str) -> list[str]:
+    return [command, str(rig), "--out", str(out), *more]
 
 
 def _last_line(said: str) -> str:
@@ -81,31 +77,26 @@ def _faulty(kind: str, when: int | str):
         count += 1
         if when not in (count, path.name):
             return whole(path, content)
-        part = path.with_name(f".{path.name}.{os.getpid()}.part")
-        path.parent.mkdir(parents=True, exist_ok=True)
-        if kind == "in a write":
-            part.write_bytes(content[: len(content) // 2])
-        elif kind == "before the rename":
-            part.write_bytes(content)
-        elif kind == "full disk":
-            limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-            resource.setrlimit(resource.RLIMIT_FSIZE, (len(content) // 2, limits[1]))
-            try:
-                whole(path, content)
-            finally:
-                resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-        elif kind == "unwritable":
-            original = files.os
-            files.os = types.SimpleNamespace(replace=_denied, getpid=os.getpid, fsync=os.fsync)
-            try:
-                whole(path, content)
-            finally:
-                files.os = original
-        elif kind == "Ctrl-C before a write":
-            os.kill(os.getpid(), signal.SIGINT)
+        if kind in ("in a write", "before the rename"):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            part = path.with_name(f".{path.name}.{os.getpid()}.part")
+            part.write_bytes(content[: len(content) // 2] if kind == "in a write" else content)
+        elif kind in ERRORS:
+            with pytest.MonkeyPatch.context() as patch:
+                if kind == "full disk":
+                    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+                    resource.setrlimit(resource.RLIMIT_FSIZE, (len(content) // 2, limits[1]))
+                else:
+                    patch.setattr(files.os, "replace", _denied)
+                try:
+                    whole(path, content)
+                finally:
+                    if kind == "full disk":
+                        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
         else:
-            whole(path, content)
-            if kind == "Ctrl-C after a write":
+            if kind != "Ctrl-C before a write":
+                whole(path, content)
+            if kind != "after a write":
                 os.kill(os.getpid(), signal.SIGINT)
         raise Killed
 
@@ -125,7 +116,7 @@ def _steps_of_a_toy() -> np.ndarray:
 
 
 def _toys(patch, rig: Path) -> None:
-    """`identify` and `diagnose` of twelve steps of NumPy, whose numbers stand for log-likelihoods."""
+    """`identify` of twelve steps of NumPy, whose numbers stand for log-likelihoods."""
     declared = read_rig(rig / "rig.toml", specs)
     fitted = begun(declared, read_logs(rig / "train", declared).data)
 
@@ -135,7 +126,6 @@ def _toys(patch, rig: Path) -> None:
         return fitted._replace(state=state)
 
     patch.setattr(identify_command, "identify", identify)
-    patch.setattr(diagnose_command, "diagnose", lambda *_, **__: _steps_of_a_toy())
 
 
 ERRORS = {"full disk": "File too large", "unwritable": "Permission denied"}
@@ -159,14 +149,14 @@ FAULTS: list[tuple[str, int | str]] = [
 def test_a_chain_of_all_faults_is_survived(rig, tmp_path, monkeypatch, capsys):
     """One run that meets all the faults, one after the other, and then goes on to its end; numbers as of no fault."""
     _toys(monkeypatch, rig)
-    assert cli.main(_order(IDENTIFY, rig, tmp_path / "whole")) == 0
+    assert cli.main(_order("identify", rig, tmp_path / "whole")) == 0
     capsys.readouterr()
     out, kept = tmp_path / "broken", 0
     for kind, when in FAULTS:
         with monkeypatch.context() as patch:
             patch.setattr(files, "replace_bytes", _faulty(kind, when))
             try:
-                code = cli.main(_order(IDENTIFY, rig, out))
+                code = cli.main(_order("identify", rig, out))
             except Killed:
                 code = None
         said = capsys.readouterr().err
@@ -186,7 +176,7 @@ def test_a_chain_of_all_faults_is_survived(rig, tmp_path, monkeypatch, capsys):
         assert steps >= kept  # nothing is lost
         kept = steps
     assert kept == 12
-    assert cli.main(_order(IDENTIFY, rig, out)) == 0
+    assert cli.main(_order("identify", rig, out)) == 0
     assert "12 finished steps in" in capsys.readouterr().err
     assert not list(out.rglob(".*.part")) and not (out / "unfinished").exists()
     left = numbers(out)
@@ -202,61 +192,40 @@ def _toy_after(steps: int) -> float:
     return x
 
 
-def _start(order: list[str]) -> subprocess.Popen:
-    program = [sys.executable, "-m", "nnap_em.commands.cli"]
-    return subprocess.Popen([*program, *order], env=ENVIRONMENT, stderr=subprocess.PIPE, text=True)
-
-
 def _steps(out: Path) -> list[int]:
     """Tells one state of the finished steps from the next."""
     return sorted(path.stat().st_mtime_ns for path in out.glob("unfinished/*.npz"))
 
 
-def _struck(order: list[str], out: Path, kind: signal.Signals, count: int):
-    """A signal from outside after a number of new finished steps."""
-    run, before = _start(order), _steps(out)
-    while run.poll() is None and count:
+def _diagnosed(rig: Path, out: Path, *more: str, kind: signal.Signals | None = None, count: int = 0) -> tuple[int, str]:
+    """Exit status and stderr of a search in its own process, which gets a signal after `count` new finished steps."""
+    program = [sys.executable, "-m", "nnap_em.commands.cli", *_order("diagnose", rig, out, *more)]
+    run = subprocess.Popen(program, env=ENVIRONMENT, stderr=subprocess.PIPE, text=True)
+    before = _steps(out)
+    while kind and run.poll() is None and count:
         time.sleep(0.005)
         steps = _steps(out)
         count, before = count - (steps != before), steps
-    assert run.poll() is None, "it was over too soon"
-    run.send_signal(kind)
-    _, said = run.communicate(timeout=120)
-    return run.returncode, said
-
-
-@pytest.mark.slow  # fast: test_a_chain_of_all_faults_is_survived
-def test_a_search_that_is_killed_and_stopped_goes_on_to_the_same_numbers(rig, tmp_path):
-    """By SIGKILL, and then by Ctrl-C."""
-    whole, out = tmp_path / "whole", tmp_path / "broken"
-    code, said = _called(_order(DIAGNOSE, rig, whole, "--quiet"))
-    assert code == 0, said
-    code, said = _struck(_order(DIAGNOSE, rig, out), out, signal.SIGKILL, 4)
-    assert code == -signal.SIGKILL, said
-    code, said = _struck(_order(DIAGNOSE, rig, out), out, signal.SIGINT, 2)
-    assert code == 130, said
-    assert re.search(r"stopped .*; the same command goes on", _last_line(said))
-    _answered_in_time(rig, out)
-    code, said = _called(_order(DIAGNOSE, rig, out))
-    assert code == 0 and "those of this run are not done again" in said, said
-    assert not list(out.rglob(".*.part")) and not (out / "unfinished").exists()
-    left = numbers(out)
-    assert left == numbers(whole)
-    assert all(len(left[name][0]) > 20 for name in left if name.endswith(".npz"))
-    assert [effect["name"] for effect in left["report"]["effects"]] == ["torsional_spring"]
-
-
-def _called(order: list[str]) -> tuple[int, str]:
-    """A command in a process like those that are killed: the programs of this one may round otherwise."""
-    run = _start(order)
+    if kind:
+        assert run.poll() is None, "it was over too soon"
+        run.send_signal(kind)
     _, said = run.communicate(timeout=300)
     return run.returncode, said
 
 
-def _answered_in_time(rig: Path, out: Path) -> None:
-    """An answer after the first fit, since no more time is left, and what goes on from there."""
+@pytest.mark.slow  # fast: test_a_chain_of_all_faults_is_survived
+def test_a_search_that_is_killed_stopped_and_out_of_time_goes_on_to_the_same_numbers(rig, tmp_path):
+    """By SIGKILL, then by Ctrl-C, then with an answer after the first fit, since no more time is left."""
+    whole, out = tmp_path / "whole", tmp_path / "broken"
+    code, said = _diagnosed(rig, whole, "--quiet")
+    assert code == 0, said
+    code, said = _diagnosed(rig, out, kind=signal.SIGKILL, count=4)
+    assert code == -signal.SIGKILL, said
+    code, said = _diagnosed(rig, out, kind=signal.SIGINT, count=2)
+    assert code == 130, said
+    assert re.search(r"stopped .*; the same command goes on", _last_line(said))
     steps = len(_steps(out))
-    code, said = _called(_order(DIAGNOSE, rig, out, "--minutes", "0.001"))
+    code, said = _diagnosed(rig, out, "--minutes", "0.001")
     assert code == MISFIT_STATUS and re.search(r"\[\d+:\d\d over\] ", said), said
     assert re.search(r"finished steps? kept; the same command goes on", _last_line(said))
     report = json.loads((out / "report.json").read_text())
@@ -264,6 +233,13 @@ def _answered_in_time(rig: Path, out: Path) -> None:
     assert "The search was not finished" in report["verdict"] and report["verdict"] in said
     assert "No effect of the catalogue" not in (out / "report.html").read_text()
     assert len(_steps(out)) >= steps
+    code, said = _diagnosed(rig, out)
+    assert code == 0 and "those of this run are not done again" in said, said
+    assert not list(out.rglob(".*.part")) and not (out / "unfinished").exists()
+    left = numbers(out)
+    assert left == numbers(whole)
+    assert all(len(left[name][0]) > 20 for name in left if name.endswith(".npz"))
+    assert [effect["name"] for effect in left["report"]["effects"]] == ["torsional_spring"]
 
 
 # --- files that are not what they should be
@@ -276,37 +252,23 @@ def stopped(rig) -> Path:
     with pytest.MonkeyPatch.context() as patch, pytest.raises(Killed):
         _toys(patch, rig)
         patch.setattr(files, "replace_bytes", _faulty("after a write", 5))
-        cli.main(_order(IDENTIFY, rig, out, "--quiet"))
+        cli.main(_order("identify", rig, out, "--quiet"))
     return out
 
 
-def _first(out: Path) -> Path:
-    return min(out.glob("unfinished/*.npz"))
-
-
-def _cut(share: float):
-    def change(out: Path) -> None:
-        content = _first(out).read_bytes()
-        _first(out).write_bytes(content[: int(share * len(content))])
-
-    return change
-
-
-def _wrong_number(out: Path) -> None:
-    with np.load(_first(out)) as stored:
-        arrays = {name: stored[name] for name in stored.files}
-    name = next(n for n, a in arrays.items() if a.dtype == np.float64 and a.size)
-    np.savez(_first(out), **arrays | {name: arrays[name] + 1e-9})
+def _flipped(content: bytes) -> bytes:
+    """One bit of the numbers, which stand before the directory of the zip."""
+    place = content.rindex(b"PK\x01\x02", 0, content.rindex(b"PK\x01\x02")) - 8
+    return content[:place] + bytes([content[place] ^ 1]) + content[place + 1 :]
 
 
 DAMAGED = {
-    "whole": (lambda out: None, 7),
-    "empty": (_cut(0.0), 8),
-    "truncated": (_cut(0.4), 8),
-    "almost whole": (_cut(0.999), 8),
-    "text": (lambda out: _first(out).write_text("time,u\n0,1\n"), 8),
-    "npz": (lambda out: np.savez(_first(out), x=np.zeros(3)), 8),
-    "number": (_wrong_number, 8),
+    "whole": (lambda content: content, 7),
+    "empty": (lambda content: b"", 8),
+    "truncated": (lambda content: content[: len(content) // 2], 8),
+    "almost whole": (lambda content: content[:-1], 8),
+    "text": (lambda content: b"time,u\n0,1\n", 8),
+    "a bit": (_flipped, 8),
 }
 """What happens to one of five finished steps, and how many of twelve are done then."""
 
@@ -316,38 +278,40 @@ def _goes_on(rig: Path, out: Path, monkeypatch) -> int:
     written, keep = [], Journal.keep
     _toys(monkeypatch, rig)
     monkeypatch.setattr(Journal, "keep", lambda *of: (written.append(of[1]), keep(*of))[1])
-    assert cli.main(_order(IDENTIFY, rig, out)) == 0
+    assert cli.main(_order("identify", rig, out)) == 0
     assert json.loads((out / "report.json").read_text())["log_likelihood"][0] == pytest.approx(_toy_after(12))
     return len(written)
 
 
 @pytest.mark.parametrize("change, done", DAMAGED.values(), ids=DAMAGED)
 def test_a_step_that_is_damaged_is_done_again(rig, stopped, tmp_path, monkeypatch, change, done):
-    out = tmp_path / "out"
-    shutil.copytree(stopped, out)
-    change(out)
+    out = Path(shutil.copytree(stopped, tmp_path / "out"))
+    first = min(out.glob("unfinished/*.npz"))
+    first.write_bytes(change(first.read_bytes()))
     assert _goes_on(rig, out, monkeypatch) == done
 
 
 def test_steps_of_another_version_are_done_again(rig, stopped, tmp_path, monkeypatch):
-    out = tmp_path / "out"
-    shutil.copytree(stopped, out)
+    out = Path(shutil.copytree(stopped, tmp_path / "out"))
     monkeypatch.setattr(journal, "surroundings", lambda: "after an edit")
     assert _goes_on(rig, out, monkeypatch) == 12
 
 
-@pytest.mark.parametrize("command", [IDENTIFY, DIAGNOSE], ids=lambda command: command[0])
-def test_a_folder_that_cannot_be_is_refused_before_the_work(rig, tmp_path, capsys, command):
+def test_a_folder_that_cannot_be_is_refused_before_the_work(rig, tmp_path, capsys):
     (tmp_path / "file").write_text("")
-    assert cli.main(_order(command, rig, tmp_path / "file" / "out")) == 2
+    assert cli.main(_order("identify", rig, tmp_path / "file" / "out")) == 2
     assert _last_line(capsys.readouterr().err) == f"nnap-em: error: {tmp_path}/file/out: Not a directory"
 
 
-def test_ctrl_c_leaves_no_half_data_set(tmp_path, monkeypatch, capsys):
-    def stop(*_):
-        raise KeyboardInterrupt
+def _stop(*_, **__):
+    raise KeyboardInterrupt
 
-    monkeypatch.setattr("nnap_em.commands.simulate.write_csv", stop)
+
+def test_ctrl_c_before_the_first_step_leaves_nothing(rig, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(identify_command, "identify", _stop)
+    assert cli.main(_order("identify", rig, tmp_path / "new")) == 130
+    assert "nothing new is kept" in _last_line(capsys.readouterr().err)
+    monkeypatch.setattr("nnap_em.commands.simulate.write_csv", _stop)
     order = ["simulate", str(tmp_path / "new"), "--system", "slide", "--sequences", "1", "--test", "0", "--steps", "9"]
     assert cli.main(order) == 130
     assert _last_line(capsys.readouterr().err) == "nnap-em: stopped; the files that were written are whole"
@@ -365,6 +329,7 @@ def test_ctrl_c_that_a_garbage_collection_swallows_stops_at_the_next_line(tmp_pa
         log("one line")
         raise AssertionError
 
+    monkeypatch.setattr(sys, "unraisablehook", lambda _: None)
     monkeypatch.setattr(check_command, "run", lost)
     assert cli.main(["check", str(tmp_path)]) == 130
     assert _last_line(capsys.readouterr().err) == "nnap-em: stopped; the files that were written are whole"
@@ -437,13 +402,3 @@ def test_the_digest_tells_apart_what_is_not_the_same():
     assert len({digest(other) for other in others}) == len(others)
     with pytest.raises(TypeError, match="object cannot be distinguished"):
         digest(object())
-
-
-def test_sweeping_leaves_what_others_are_writing(tmp_path):
-    dead = subprocess.Popen([sys.executable, "-c", ""])
-    dead.wait()
-    names = {pid: f".model.npz.{pid}.part" for pid in (dead.pid, os.getpid(), os.getppid())}
-    for name in (*names.values(), ".other.part", "model.npz"):
-        (tmp_path / name).write_text("")
-    sweep(tmp_path)
-    assert {p.name for p in tmp_path.iterdir()} == {names[os.getppid()], ".other.part", "model.npz"}

@@ -1,11 +1,60 @@
-"""Flags of the compiler are set where it knows them; programs are released where they hold too many memory maps."""
+"""Compiled programs: their table, the flags of the compiler, and their release where they hold too many memory maps."""
 
 import os
+import time
 
 import jax
-import pytest
+import jax.numpy as jnp
 
 from nnap_em.numerics import programs
+from nnap_em.numerics.parallel import each
+from nnap_em.numerics.profile import profiling, stage
+
+
+def test_programs_are_counted_once_for_every_shape_and_by_name(capsys):
+    @jax.jit
+    def cube(x):
+        return x**3
+
+    with profiling(show=True) as profile:
+        for size in (3, 4, 3):
+            cube(jnp.ones(size))
+    seconds = profile.spent["cube"]["compile"]
+    assert len(seconds) == 2
+    rows = {line.split()[0]: line.split() for line in capsys.readouterr().out.splitlines()}
+    assert rows["cube"][1] == "2" and rows["cube"][4] == f"{sum(seconds):.2f}"
+    count = len(profile.spent)
+    jax.jit(lambda x: x + 1)(jnp.arange(7))  # after it
+    assert len(profile.spent) == count
+
+
+def _scaled(common, one):
+    return common * one
+
+
+def test_a_program_for_every_sequence_is_compiled_once_whether_or_not_its_arrays_are_bound_to_a_device():
+    free, batch = jnp.asarray(2.0), jnp.arange(3.0)
+    bound = jax.device_put(free, jax.local_devices()[0])  # as the M-step hands its model back
+    first = each(_scaled, free, batch)
+    with profiling() as profile:
+        again = each(_scaled, bound, batch)
+    assert not profile.spent
+    assert jnp.array_equal(first, again)
+
+
+def test_time_counts_for_the_outermost_stage_alone():
+    @stage("refit")
+    def inner():
+        time.sleep(0.02)
+
+    with profiling() as profile:
+        with stage("fit"):
+            inner()
+        inner()
+    (fit,), (refit,) = profile.spent["fit"]["run"], profile.spent["refit"]["run"]
+    assert fit >= 0.02 <= refit
+    rows = {line.split()[0]: line.split() for line in str(profile).splitlines()}
+    assert [rows[name][-1] for name in ("fit", "refit")] == [f"{fit:.2f}", f"{refit:.2f}"]
 
 
 def test_programs_are_released_beyond_the_bound(monkeypatch):
@@ -16,17 +65,17 @@ def test_programs_are_released_beyond_the_bound(monkeypatch):
     assert programs.release_programs(49) and cleared == [True]
 
 
-@pytest.mark.parametrize(
-    "version, before, after",
-    [
-        ("0.10.2", "", "--xla_cpu_use_fusion_emitters=false"),
-        ("0.10.2", "--xla_a=1", "--xla_a=1 --xla_cpu_use_fusion_emitters=false"),
-        ("0.10.2", "--xla_cpu_use_fusion_emitters=true", "--xla_cpu_use_fusion_emitters=true"),
-        ("0.11.0", "--xla_a=1", "--xla_a=1"),
-    ],
-)
-def test_the_older_emitters_are_asked_for_where_they_are_known(version, before, after, monkeypatch):
-    monkeypatch.setenv("XLA_FLAGS", before)
-    monkeypatch.setattr(programs.version, "__version__", version)
-    programs.use_older_emitters()
-    assert os.environ["XLA_FLAGS"] == after
+FLAGS = [
+    ("0.10.2", "", "--xla_cpu_use_fusion_emitters=false"),
+    ("0.10.2", "--xla_a=1", "--xla_a=1 --xla_cpu_use_fusion_emitters=false"),
+    ("0.10.2", "--xla_cpu_use_fusion_emitters=true", "--xla_cpu_use_fusion_emitters=true"),
+    ("0.11.0", "--xla_a=1", "--xla_a=1"),
+]
+
+
+def test_the_older_emitters_are_asked_for_where_they_are_known(monkeypatch):
+    for version, before, after in FLAGS:
+        monkeypatch.setenv("XLA_FLAGS", before)
+        monkeypatch.setattr(programs.version, "__version__", version)
+        programs.use_older_emitters()
+        assert os.environ["XLA_FLAGS"] == after

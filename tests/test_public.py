@@ -1,17 +1,24 @@
-"""Public functions: their docstrings have sections, and the examples in them run on one small slide."""
+"""Public names: where they are, and that the examples of their docstrings run on one small slide."""
 
 import doctest
+import importlib
 import inspect
+import re
+import tomllib
+from types import ModuleType
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import nnap
+from rigs import slide_rig
+from shell import ROOT
 
 import nnap_em
-from nnap_em.commands.cli import main
 
-ROOMS = {name: getattr(nnap_em, name) for name in nnap_em._namespaces}
+TOP = {name: getattr(nnap_em, name) for name in nnap_em.__all__}
+ROOMS = {name: value for name, value in TOP.items() if isinstance(value, ModuleType)}
 FUNCTIONS = {
     f"{room}.{name}".removeprefix("nnap_em."): getattr(home, name)
     for room, home in ({"nnap_em": nnap_em} | ROOMS).items()
@@ -20,18 +27,40 @@ FUNCTIONS = {
 }
 
 
+def test_names_are_loaded_from_their_homes_and_listed():
+    assert nnap_em.identify is importlib.import_module("nnap_em.fit.identify").identify
+    assert set(TOP) <= set(dir(nnap_em))
+    with pytest.raises(AttributeError, match="no attribute 'identity'"):
+        _ = nnap_em.identity  # type: ignore[attr-defined]
+
+
+def test_version_is_that_of_the_package(capsys):
+    with pytest.raises(SystemExit, match="0"):
+        nnap("--version")
+    version = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
+    assert capsys.readouterr().out == f"nnap-em {version}\n"
+    assert version == nnap_em.__version__
+
+
+def test_reference_has_every_public_name():
+    listed = re.findall(r"^::: (nnap_em\.[\w.]+)\.(\w+)$", (ROOT / "docs/api.md").read_text(), re.MULTILINE)
+    there = [id(getattr(importlib.import_module(home), name)) for home, name in listed]
+    public = [value for name, value in TOP.items() if name not in {*ROOMS, "__version__"}]
+    public += [getattr(room, name) for room in ROOMS.values() for name in room.__all__]
+    assert sorted(there) == sorted({id(value) for value in public})
+
+
 @pytest.fixture(scope="module")
-def names(tmp_path_factory):
-    """A slide with its logs, and a fit of three epochs."""
+def names(tmp_path_factory, slide_fit):
+    """A slide with its logs, and a fit of it."""
     folder = tmp_path_factory.mktemp("public") / "bench"
-    assert main(["simulate", str(folder), "--system", "slide", "--sequences", "4", "--test", "1", "--steps", "95"]) == 0
-    rig, key = nnap_em.read_rig(folder / "rig.toml"), jax.random.key(0)
+    assert nnap("simulate", folder, "--system", "slide", "--sequences", 4, "--test", 1, "--steps", 95) == 0
+    rig, key = slide_rig(), jax.random.key(0)
     logs, test = (nnap_em.read_logs(folder / part, rig) for part in ("train", "test"))
-    fits = [nnap_em.identify(rig, logs.data, key=jax.random.key(seed), epochs=3) for seed in (0, 1)]
-    diagnosis = nnap_em.Diagnosis(fits[0], fits[0], (), ())
+    diagnosis = nnap_em.Diagnosis(slide_fit, slide_fit, (), ())
     return {
         "nnap_em": nnap_em, "np": np, "jnp": jnp, "folder": str(folder), "rig": rig, "key": key, "logs": logs,
-        "train": logs.data, "test": test.data, "fit": fits[0], "other": fits[1], "diagnosis": diagnosis,
+        "train": logs.data, "test": test.data, "fit": slide_fit, "other": slide_fit, "diagnosis": diagnosis,
     }  # fmt: skip
 
 

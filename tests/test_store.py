@@ -1,13 +1,10 @@
 """A stored model: the same numbers to the last bit, or refused with the reason."""
 
 import errno
-import hashlib
 import json
-import os
 import pickle
 import shutil
 from pathlib import Path
-from types import SimpleNamespace
 
 import equinox as eqx
 import jax
@@ -21,7 +18,7 @@ from nnap_em.fit.identify import Identified, begin
 from nnap_em.fit.store import fingerprint, load, read, save
 from nnap_em.model.law import StribeckLaw
 from nnap_em.smoother import AbstractSmoother, kinds
-from nnap_em.smoother.gaussian import CubatureSmoother, ExtendedKalmanSmoother
+from nnap_em.smoother.gaussian import CubatureSmoother
 from nnap_em.smoother.particle import ExactBackward, Guided, ParticleSmoother
 from nnap_em.storage import files
 from nnap_em.storage.files import StoreError
@@ -34,8 +31,7 @@ RIGS = {
     "arm": Rig(
         "ärm", "acrobot", ARM, True, ("u",), (2,), 0.01, "session", ("theta1",), {}, {"theta2": Declared(0.1, 0.5)}
     ),
-    "slide": Rig("slide", "slide", {"m": Declared(1.0, 0.0)}, True, ("f",), (1,), 0.02, "sequence", ("x",), {}, {}),
-    "free": Rig(
+    "slide": Rig(
         "free", "slide", {"m": Declared(1.0, 0.2)}, False, ("f",), (1,), 0.02, "sequence", ("dx", "x"), {"x": 0.1}, {}
     ),
 }
@@ -87,18 +83,12 @@ def file(tmp_path, stored) -> Path:
 
 
 def _rewrite(path: Path, change) -> None:
-    """Change header and arrays of a file, with a checksum that holds."""
+    """Change header and arrays of a file."""
     with np.load(path) as content:
         arrays = {name: content[name] for name in content.files}
     header = json.loads(arrays.pop("header").tobytes())
-    arrays.pop("sha256")
     change(header, arrays)
-    text = json.dumps(header).encode()
-    digest = hashlib.sha256(text)
-    for name in sorted(arrays):
-        digest.update(f"{name}{arrays[name].dtype.str}{arrays[name].shape}".encode() + arrays[name].tobytes())
-    checksum = np.frombuffer(digest.digest(), np.uint8)
-    np.savez(path, header=np.frombuffer(text, np.uint8), sha256=checksum, **arrays)
+    np.savez(path, header=np.frombuffer(json.dumps(header).encode(), np.uint8), **arrays)
 
 
 @pytest.mark.parametrize("name", RIGS)
@@ -115,19 +105,17 @@ def test_a_stored_model_comes_back_to_the_last_bit(tmp_path, name):
     np.testing.assert_array_equal(stored.fitted.model.unknown(v), fitted.model.unknown(v))
 
 
-SMOOTHERS = {
-    "cubature": lambda bank: CubatureSmoother(bank, window=30, inflations=(1.0, 2.0)),
-    "extended": ExtendedKalmanSmoother,
-    "particles": lambda bank: ParticleSmoother(
-        CubatureSmoother(bank, iterations=2), Guided(), ExactBackward(7), num_particles=31, dtype=float
-    ),
-}
-
-
-@pytest.mark.parametrize("make", SMOOTHERS.values(), ids=SMOOTHERS)
-def test_a_stored_model_keeps_its_smoother(tmp_path, make):
+@pytest.mark.parametrize("windows", [True, False])
+def test_a_stored_model_keeps_its_smoother(tmp_path, windows):
     """Its path may be a string."""
-    fitted = begin(RIGS["arm"], _data(RIGS["arm"]), key=jax.random.key(5), smoother=make)
+
+    def make(bank):
+        if windows:
+            return CubatureSmoother(bank, window=30, inflations=(1.0, 2.0))
+        start = CubatureSmoother(bank, iterations=2)
+        return ParticleSmoother(start, Guided(), ExactBackward(7), num_particles=31, dtype=float)
+
+    fitted = begin(RIGS["slide"], _data(RIGS["slide"]), key=jax.random.key(5), smoother=make)
     save(f"{tmp_path}/model.npz", fitted)
     loaded = load(f"{tmp_path}/model.npz")
     assert _bits(loaded) == _bits(fitted)
@@ -172,19 +160,11 @@ def test_a_write_that_fails_leaves_the_old_file(tmp_path, file, monkeypatch):
     def full(*_):
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(files, "os", SimpleNamespace(fsync=full, getpid=os.getpid, replace=os.replace))
+    monkeypatch.setattr(files.os, "fsync", full)
     with pytest.raises(OSError, match=r"No space left.*model\.npz"):
         save(file, _fitted("slide"))
     assert file.read_bytes() == old
     assert [path.name for path in tmp_path.iterdir()] == ["model.npz"]
-
-
-@pytest.mark.parametrize("share", [0.0, 0.3, 0.999])
-def test_a_truncated_file_is_refused(file, share):
-    content = file.read_bytes()
-    file.write_bytes(content[: int(share * len(content))])
-    with pytest.raises(StoreError, match=r"model\.npz: .*damaged or cut short \(\d+ bytes\); give the model"):
-        load(file)
 
 
 def test_a_flipped_bit_changes_no_number_unnoticed(file):
@@ -199,30 +179,14 @@ def test_a_flipped_bit_changes_no_number_unnoticed(file):
         content[place] ^= 0x10
 
 
-def _other_header(path: Path) -> None:
-    np.savez(path, header=np.frombuffer(b'{"kind": "notes"}', np.uint8))
-
-
-FOREIGN = {
-    "empty": (lambda path: path.write_bytes(b""), "no model"),
-    "text": (lambda path: path.write_text("time,u\n0,1\n"), "no model"),
-    "npz": (lambda path: np.savez(path, x=np.zeros(3)), "no model"),
-    "other npz with a header": (_other_header, "another program"),
-    "pickle": (lambda path: path.write_bytes(pickle.dumps({"a": 1})), "no model"),
-    "folder": (lambda path: path.mkdir(), "cannot be read"),
-    "absent": (lambda path: None, "cannot be read"),
-}
-
-
 def test_a_file_of_a_version_with_more_in_it_is_read_where_that_was_empty(file):
-    """Friction could have memory: fits without any are as they were, and one with it is refused."""
+    """Friction could have memory, and files a checksum: fits without memory are as they were, others are refused."""
     bits = _bits(load(file))
-    _rewrite(file, lambda header, arrays: None)
-    assert _bits(load(file)) == bits
 
     def older(header, arrays):
         header["rig"]["memory"] = False
         header["leaves"]["/memory"] = {"is": "plain", "of": ""}
+        arrays["sha256"] = np.zeros(32, np.uint8)
 
     _rewrite(file, older)
     assert _bits(load(file)) == bits
@@ -231,12 +195,26 @@ def test_a_file_of_a_version_with_more_in_it_is_read_where_that_was_empty(file):
         load(file)
 
 
-@pytest.mark.parametrize("make, reason", FOREIGN.values(), ids=FOREIGN)
-def test_a_foreign_file_is_refused(tmp_path, make, reason):
-    path = tmp_path / "foreign.npz"
-    make(path)
-    with pytest.raises(StoreError, match=rf"foreign\.npz: .*{reason}.*; give the model\.npz"):
-        load(path)
+FOREIGN = {
+    "cut short": (lambda path, whole: path.write_bytes(whole[: len(whole) // 3]), "no model, or damaged or cut short"),
+    "almost whole": (lambda path, whole: path.write_bytes(whole[:-1]), "no model, or damaged or cut short"),
+    "empty": (lambda path, _: path.write_bytes(b""), "no model"),
+    "text": (lambda path, _: path.write_text("time,u\n0,1\n"), "no model"),
+    "npz": (lambda path, _: np.savez(path, x=np.zeros(3)), "no model"),
+    "other header": (lambda path, _: np.savez(path, header=np.frombuffer(b'{"kind": "a"}', np.uint8)), "another pro"),
+    "pickle": (lambda path, _: path.write_bytes(pickle.dumps({"a": 1})), "no model"),
+    "folder": (lambda path, _: path.mkdir(), "cannot be read"),
+    "absent": (lambda path, _: None, "cannot be read"),
+}
+
+
+def test_a_foreign_file_is_refused(tmp_path, stored):
+    for name, (make, reason) in FOREIGN.items():
+        path = tmp_path / name / "foreign.npz"
+        path.parent.mkdir()
+        make(path, stored.read_bytes())
+        with pytest.raises(StoreError, match=rf"foreign\.npz: .*{reason}.*; give the model\.npz"):
+            load(path)
 
 
 def _wrong_shape(header, arrays):
@@ -273,21 +251,17 @@ MISFITS = {
 }
 
 
-@pytest.mark.parametrize("change, reason", MISFITS.values(), ids=MISFITS)
-def test_a_file_of_another_version_is_refused(file, change, reason):
-    _rewrite(file, change)
-    with pytest.raises(StoreError, match=rf"model\.npz: .*{reason}.*; (identify again|registered are)"):
-        load(file)
+def test_a_file_of_another_version_is_refused(file):
+    whole = file.read_bytes()
+    for change, reason in MISFITS.values():
+        file.write_bytes(whole)
+        _rewrite(file, change)
+        with pytest.raises(StoreError, match=rf"model\.npz: .*{reason}.*; (identify again|registered are)"):
+            load(file)
 
 
-def test_a_changed_number_breaks_the_checksum_and_64_bits_are_not_rounded(file):
+def test_64_bits_are_not_rounded(file):
     with jax.enable_x64(False), pytest.raises(StoreError, match="64 bits; first call jax"):
-        load(file)
-    with np.load(file) as content:
-        arrays = {name: content[name] for name in content.files}
-    arrays["/state/model/log_q"] = arrays["/state/model/log_q"] + 1e-9
-    np.savez(file, **arrays)
-    with pytest.raises(StoreError, match="checksum does not hold; use another copy"):
         load(file)
 
 

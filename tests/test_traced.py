@@ -5,6 +5,7 @@ import json
 import pickle
 import subprocess
 import sys
+from pathlib import Path
 from typing import NamedTuple
 
 import jax
@@ -18,22 +19,20 @@ from nnap_em.model.state_space import Inputs, StateSpaceModel
 from nnap_em.numerics import parallel, traced
 from nnap_em.numerics.gaussian import Gaussian
 from nnap_em.smoother.kalman import Affine, Cubature, Tangent
-from nnap_em.storage.cache import Cache
 
 
 @pytest.fixture
-def cache(tmp_path, monkeypatch):
+def cache(tmp_path, monkeypatch) -> Path:
     """A cache in use, in a process that has no program yet."""
-    programs = Cache(tmp_path / "cache")
-    monkeypatch.setattr(traced._Programs, "cache", programs)
+    monkeypatch.setattr(traced._Programs, "folder", tmp_path / "cache")
     monkeypatch.setattr(traced._Programs, "ready", {})
     for function in (_linearised, _called_back, _wrong, _named):  # as if it were the package's
         monkeypatch.setattr(function, "__module__", "nnap_em.somewhere")
-    return programs
+    return tmp_path / "cache"
 
 
-def _kept(cache: Cache) -> set[str]:
-    return {path.name for path in cache.folder.glob("*")}
+def _kept(cache: Path) -> set[str]:
+    return {path.name for path in cache.glob("*")}
 
 
 def _linearised(common, one):
@@ -69,19 +68,45 @@ def _same(a, b) -> None:
         np.testing.assert_array_equal(one, other)
 
 
-def test_a_program_found_again_gives_the_same_to_the_last_bit_and_traces_nothing(cache, work, monkeypatch):
+class _Opened:
+    """Writes a file where it is unpickled."""
+
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return open, (str(self.path), "w")
+
+
+def test_a_program_found_again_gives_the_same_to_the_last_bit_and_traces_nothing(cache, work, monkeypatch, tmp_path):
+    """An entry is data that runs nothing, neither a pickle nor a function in it; a damaged one is made anew."""
     calls, transition = [], type(work.model).transition
-    monkeypatch.setattr(traced._Programs, "cache", None)
-    plain = _done(work, monkeypatch)
-    monkeypatch.setattr(traced._Programs, "cache", cache)
+    with monkeypatch.context() as patch:
+        patch.setattr(traced._Programs, "folder", None)
+        plain = _done(work, monkeypatch)
     first = _done(work, monkeypatch)
-    assert len(_kept(cache)) == 1
-    monkeypatch.setattr(type(work.model), "transition", lambda *args: calls.append(1) or transition(*args))
-    again = _done(work, monkeypatch)
+    (path,) = cache.glob("*")
+    with monkeypatch.context() as patch:
+        patch.setattr(type(work.model), "transition", lambda *args: calls.append(1) or transition(*args))
+        again = _done(work, monkeypatch)
+        other = _done(work._replace(x=work.x + 1.0), monkeypatch)  # other numbers are no other program
     assert not calls and len(_kept(cache)) == 1
     _same(plain, first)
     _same(first, again)
     assert type(again) is type(plain)
+    assert np.abs(np.asarray(first.offset - other.offset)).max() > 0
+
+    whole, mark = path.read_bytes(), tmp_path / "mark"
+    form, _, program = whole.partition(b"\n")
+    assert json.loads(form)[0] == "nnap_em.smoother.kalman:Affine"
+    foreign = json.dumps(["os:mkdir", str(mark)]).encode() + b"\n" + program
+    for content in (pickle.dumps(_Opened(mark)), pickle.dumps((program, _Opened(mark))), foreign):
+        path.write_bytes(content)
+        assert traced._read(path) is None
+        assert not mark.exists()
+    path.write_bytes(whole[: len(whole) // 2])
+    _same(first, _done(work, monkeypatch))
+    assert len(path.read_bytes()) == len(whole)
 
 
 OTHERS = {
@@ -89,43 +114,24 @@ OTHERS = {
     "constant": lambda work: work._replace(model=dataclasses.replace(work.model, substeps=3)),
     "shape": lambda work: jax.tree.map(lambda a: a[:, :4] if a.ndim == 3 else a, work),
     "type": lambda work: work._replace(u=work.u.astype(jnp.float32)),
+    "text of the package": lambda work: work,
 }
 
 
 @pytest.mark.parametrize("other", OTHERS)
 def test_what_decides_a_program_makes_another(cache, work, monkeypatch, other):
     _done(work, monkeypatch)
+    if other == "text of the package":
+        monkeypatch.setattr(traced, "surroundings", lambda: "after an edit")
     with jax.numpy_dtype_promotion("standard"):
         changed = _done(OTHERS[other](work), monkeypatch)
         assert len(_kept(cache)) == 2
-        monkeypatch.setattr(traced._Programs, "cache", None)
+        monkeypatch.setattr(traced._Programs, "folder", None)
         _same(changed, _done(OTHERS[other](work), monkeypatch))
-
-
-def test_other_numbers_are_no_other_program(cache, work, monkeypatch):
-    first = _done(work, monkeypatch)
-    second = _done(work._replace(x=work.x + 1.0), monkeypatch)
-    assert len(_kept(cache)) == 1
-    assert np.abs(np.asarray(first.offset - second.offset)).max() > 0
-
-
-def test_another_text_of_the_package_makes_another(cache, work, monkeypatch):
-    _done(work, monkeypatch)
-    monkeypatch.setattr(traced, "surroundings", lambda: "after an edit")
-    _done(work, monkeypatch)
-    assert len(_kept(cache)) == 2
 
 
 def _own(common, one):
     return common * one
-
-
-def test_what_a_key_cannot_tell_is_not_kept(cache):
-    """A function of another package may say something else tomorrow; other numbers are taken anew."""
-    for factor in (2.0, 3.0):
-        product = parallel.each(_own, jnp.asarray(factor), jnp.arange(3.0))
-        np.testing.assert_array_equal(product, factor * np.arange(3.0))
-    assert not _kept(cache)
 
 
 def _called_back(common, one):
@@ -140,72 +146,23 @@ def _named(common, one):
     return {"doubled": common * one}
 
 
-def test_what_cannot_be_written_down_runs_all_the_same(cache):
-    """Nor is an outcome with other nodes than tuples and lists."""
-    np.testing.assert_array_equal(parallel.each(_called_back, None, jnp.arange(3.0)), [0.0, 2.0, 4.0])
-    out = parallel.each(_named, jnp.asarray(2.0), jnp.arange(3.0))
-    np.testing.assert_array_equal(out["doubled"], [0.0, 2.0, 4.0])
-    assert not _kept(cache)
+def test_what_a_key_cannot_tell_or_a_file_cannot_hold_runs_all_the_same(cache, work, monkeypatch):
+    """A function of another package may say something else tomorrow; so may a closure."""
+    numbers = jnp.arange(3.0)
+    for factor in (2.0, 3.0):
+        np.testing.assert_array_equal(parallel.each(_own, jnp.asarray(factor), numbers), factor * np.arange(3.0))
+    np.testing.assert_array_equal(parallel.each(_called_back, None, numbers), [0.0, 2.0, 4.0])
+    np.testing.assert_array_equal(parallel.each(_named, jnp.asarray(2.0), numbers)["doubled"], [0.0, 2.0, 4.0])
     with pytest.raises(ZeroDivisionError, match="told by the function"):
-        parallel.each(_wrong, None, jnp.arange(3.0))
-
-
-def test_a_closure_is_told_by_nothing():
-    def made(slope):
-        return lambda v: slope * v
-
-    made.__module__ = "nnap_em.somewhere"
-    inside = made(2.0)
-    inside.__module__ = "nnap_em.somewhere"
+        parallel.each(_wrong, None, numbers)
+    slope = 2.0
+    closure = lambda v: slope * v  # noqa: E731
+    closure.__module__ = "nnap_em.somewhere"
     with pytest.raises(TypeError, match="somewhere"):
-        traced._key(len, [], inside)
-
-
-def test_what_is_damaged_is_made_anew(cache, work, monkeypatch):
-    first = _done(work, monkeypatch)
-    (name,) = _kept(cache)
-    whole = (cache.folder / name).read_bytes()
-    (cache.folder / name).write_bytes(whole[: len(whole) // 2])
-    _same(first, _done(work, monkeypatch))
-    assert len((cache.folder / name).read_bytes()) == len(whole)
-
-
-class _Opened:
-    """Writes a file where it is unpickled."""
-
-    def __init__(self, path):
-        self.path = path
-
-    def __reduce__(self):
-        return open, (str(self.path), "w")
-
-
-def test_an_entry_is_data_and_runs_nothing(cache, work, monkeypatch, tmp_path):
-    """Neither a pickle nor the name of a function in the place of a program."""
-    _done(work, monkeypatch)
-    (name,) = _kept(cache)
-    whole, mark = (cache.folder / name).read_bytes(), tmp_path / "mark"
-    form, _, program = whole.partition(b"\n")
-    assert json.loads(form)[0] == "nnap_em.smoother.kalman:Affine"
-    assert traced._unpacked(whole) is not None
-    other = json.dumps(["os:mkdir", str(mark)]).encode() + b"\n" + program
-    for content in (pickle.dumps(_Opened(mark)), pickle.dumps((program, _Opened(mark))), other):
-        assert traced._unpacked(content) is None
-        assert not mark.exists()
-
-
-def test_a_shelf_that_cannot_be_written_is_none(cache, work, monkeypatch, tmp_path):
-    (tmp_path / "file").write_text("no folder")
-    monkeypatch.setattr(traced._Programs, "cache", Cache(tmp_path / "file"))
+        traced._key(len, [], closure)
+    assert not _kept(cache)
+    cache.write_text("no folder")
     assert np.isfinite(np.asarray(_done(work, monkeypatch).matrix)).all()
-
-
-def test_what_a_killed_process_left_half_written_goes(tmp_path):
-    dead = subprocess.Popen([sys.executable, "-c", ""])
-    dead.wait()
-    (tmp_path / f".key.{dead.pid}.part").write_text("half")
-    (tmp_path / "key").write_text("whole")
-    assert _kept(Cache(tmp_path)) == {"key"}
 
 
 TWO = """
@@ -217,9 +174,8 @@ from nnap_em.model.simulate import examples, sweep_experiment
 from nnap_em.numerics import parallel, traced
 from nnap_em.smoother.gaussian import CubatureSmoother
 from nnap_em.smoother.start import StartBank
-from nnap_em.storage.cache import Cache
 from pathlib import Path
-traced.use_cache(Cache(Path(sys.argv[1])))
+traced.use_cache(Path(sys.argv[1]))
 parallel.use_every_device()
 model, sweep = examples["slide"]()
 data, calls = sweep_experiment(model, sweep, 3, 40, key=jax.random.key(0)).data, []

@@ -1,7 +1,6 @@
 """The command line: arguments in, exit status out; the work is in `commands`, and JAX is loaded only for it."""
 
 import argparse
-import ast
 import functools
 import importlib
 import math
@@ -59,8 +58,8 @@ def parser() -> argparse.ArgumentParser:
 
     def command(name: str) -> argparse.ArgumentParser:
         """The parser of a command, whose help is the docstring of its module, which is not imported for that."""
-        tree = ast.parse(Path(__file__).with_name(f"{_MODULES.get(name, name)}.py").read_text())
-        summary, _, examples = (ast.get_docstring(tree, clean=False) or "").partition("\n\n")
+        text = Path(__file__).with_name(f"{_MODULES.get(name, name)}.py").read_text()
+        summary, _, examples = text.split('"""')[1].partition("\n\n")
         short = f"{summary[0].lower()}{summary[1:]}".rstrip(".")
         return _new(commands.add_parser, summary, examples, name=name, help=short)
 
@@ -171,6 +170,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
         # XLA takes tuning hints of its own for features of a processor, and logs an error for each kept program.
         os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # [github.com/openxla/xla/issues/44565]
+        from ..numerics.profile import profiling
         from . import common  # loads JAX
 
         with warnings.catch_warnings(), _stoppable(silent if getattr(args, "quiet", False) else _log) as log:
@@ -179,7 +179,7 @@ def main(argv: Sequence[str] | None = None) -> int:
                 warnings.simplefilter("always", kind)
             common.set_up()
             run = importlib.import_module(f".{_MODULES.get(args.command, args.command)}", __package__).run
-            with common.profiled(getattr(args, "profile", False)):
+            with profiling(getattr(args, "profile", False)):
                 return run(args, log) or 0
     except KeyboardInterrupt as stopped:
         _log(str(stopped) or "stopped; the files that were written are whole")
@@ -195,34 +195,26 @@ def main(argv: Sequence[str] | None = None) -> int:
 @contextmanager
 def _stoppable(log: Log) -> Iterator[Log]:
     """`log`, which ends a command that lost its Ctrl-C: exceptions raised in a garbage collection are dropped."""
-    interrupted = False
+    interrupted = []
 
     def handle(number: int, frame: FrameType | None) -> None:
-        nonlocal interrupted
-        interrupted = True
-        signal.default_int_handler(number, frame)
+        interrupted.append(number)
+        raise KeyboardInterrupt
 
     def line(text: str) -> None:
         log(text)
         if interrupted:
             raise KeyboardInterrupt
 
-    def dropped(raised: Any) -> None:
-        if not issubclass(raised.exc_type, KeyboardInterrupt):
-            unraisable(raised)
-
-    unraisable = sys.unraisablehook
     ours = threading.current_thread() is threading.main_thread()
     ours = ours and signal.getsignal(signal.SIGINT) is signal.default_int_handler  # not where it is ignored
     if ours:
         signal.signal(signal.SIGINT, handle)
-        sys.unraisablehook = dropped
     try:
         yield line
     finally:
         if ours:
             signal.signal(signal.SIGINT, signal.default_int_handler)
-            sys.unraisablehook = unraisable
 
 
 def _line(error: Exception) -> str | None:

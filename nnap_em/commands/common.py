@@ -1,9 +1,7 @@
 """Common parts of the commands: set-up, data sets, model files, and runs that go on after a stop."""
 
 import argparse
-import hashlib
 import os
-import platform
 import tempfile
 import warnings
 from collections.abc import Iterator, Sequence
@@ -30,11 +28,9 @@ from ..fit.predict import GIVEN
 from ..fit.store import AFTER_FILE, MODEL_FILE, Stored, fingerprint, model_file, read
 from ..numerics.digits import counted
 from ..numerics.parallel import use_every_device
-from ..numerics.profile import profiling
 from ..numerics.programs import use_older_emitters
 from ..numerics.traced import use_cache
 from ..report.tables import FRICTION
-from ..storage.cache import Cache
 from ..storage.files import StoreError, check_own, cores, sweep
 from ..storage.journal import Journal, keeping
 from ..storage.log import Log
@@ -65,42 +61,18 @@ def set_up() -> None:
             with suppress(RuntimeError):  # JAX runs already: it keeps the devices that it has
                 jax.config.update("jax_num_cpu_devices", min(most_devices, cores()))
         use_every_device()
-    chosen = os.environ.get("JAX_COMPILATION_CACHE_DIR")
-    traced = "traced"  # folder of the programs before they were compiled, in that of the compiled ones
-    if chosen:
-        use_cache(Cache(Path(chosen) / traced))
-    if getattr(jax.config, "jax_compilation_cache_dir", None) is not None:
-        return
-    home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    folder = Path(home) / "nnap_em" / "jax" / _processor()
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError:
-        return
-    if os.access(folder, os.W_OK):
+    folder = getattr(jax.config, "jax_compilation_cache_dir", None)
+    if folder is None:
+        folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "nnap_em" / "jax"
+        with suppress(OSError):
+            folder.mkdir(parents=True, exist_ok=True)
+        if not os.access(folder, os.W_OK):
+            return
         jax.config.update("jax_compilation_cache_dir", str(folder))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)  # many small programs
-        use_cache(Cache(folder / traced))
-
-
-def _processor(about: Path = Path("/proc/cpuinfo")) -> str:
-    """Digest of the features of the processor: a program of another one may end with an illegal instruction here."""
-    try:
-        features = next(line for line in about.read_text().splitlines() if line.startswith(("flags", "Features")))
-    except (OSError, StopIteration):
-        features = platform.processor() or platform.machine()
-    return hashlib.sha256(features.encode()).hexdigest()[:16]
-
-
-@contextmanager
-def profiled(enabled: bool) -> Iterator[None]:
-    """Print what was compiled inside, also of a run that was stopped."""
-    with profiling() as profile:
-        try:
-            yield
-        finally:
-            if enabled:
-                print(profile)
+    elif "JAX_COMPILATION_CACHE_DIR" not in os.environ:  # it was set in this process, not for commands
+        return
+    use_cache(Path(folder) / "traced")
 
 
 class Bench(NamedTuple):
@@ -151,9 +123,8 @@ def logs_of(file: Path, stored: Stored, folders: Sequence[Path], trust: bool) ->
     Raises DataError where they are not there, or are others.
     """
     folders = folders or list(map(Path, stored.notes.get("logs", [])))
-    gone = next((folder for folder in folders if not folder.is_dir()), None)
-    if not folders or gone:
-        problem = f"its logs are not at {gone}" if gone else "it does not say where its logs are"
+    if gone := [folder for folder in folders if not folder.is_dir()] or not folders:
+        problem = f"its logs are not at {gone[0]}" if folders else "it does not say where its logs are"
         raise DataError(f"{file}: {problem}; give their folder with --logs FOLDER")
     rig = read_rig(folders[0] / "rig.toml", specs)
     train = read_training(rig, folders, trust)
@@ -233,17 +204,17 @@ def remove_reports(out: Path) -> None:
         (out / name).unlink(missing_ok=True)
 
 
-# --- runs that go on after a stop
-
-
 @contextmanager
 def resumable(args: argparse.Namespace, bench: Bench, log: Log) -> Iterator[Journal]:
     """Keep every finished step of what is done inside until all of it is, and do none again that was kept.
 
-    A journal that is left `open` is kept after the end, too.
+    A journal that is left `open` is kept after the end, too.  A new folder does not stay behind empty.
     """
-    journal = Journal(args.out / UNFINISHED)
-    with _folder(args.out), _reporting(journal):
+    journal, made = Journal(args.out / UNFINISHED), not args.out.exists()
+    args.out.mkdir(parents=True, exist_ok=True)
+    tempfile.TemporaryFile(dir=args.out).close()  # refused where it cannot be written to
+    try:
+        sweep(args.out)
         sweep(journal.folder)
         if journal.files:
             kept = counted(len(journal.files), "finished step")
@@ -254,6 +225,15 @@ def resumable(args: argparse.Namespace, bench: Bench, log: Log) -> Iterator[Jour
             yield journal
         if not journal.open:
             journal.clear()
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(go_on(journal)) from None
+    except OSError as error:
+        file = f"{error.filename}: " if error.filename else ""
+        raise Halted(f"{file}{error.strerror or error}; {go_on(journal)}") from error
+    finally:
+        for empty in (journal.folder, args.out) if made else ():
+            with suppress(OSError):  # it is not
+                empty.rmdir()
 
 
 def go_on(journal: Journal) -> str:
@@ -261,31 +241,3 @@ def go_on(journal: Journal) -> str:
     if not journal.done:
         return "stopped before the end of a step; nothing new is kept"
     return f"stopped with {counted(len(journal.done), 'finished step')} kept; the same command goes on"
-
-
-@contextmanager
-def _reporting(journal: Journal) -> Iterator[None]:
-    """Report the finished steps where a run is stopped or a file cannot be written."""
-    try:
-        yield
-    except KeyboardInterrupt:
-        raise KeyboardInterrupt(go_on(journal)) from None
-    except OSError as error:
-        file = f"{error.filename}: " if error.filename else ""
-        raise Halted(f"{file}{error.strerror or error}; {go_on(journal)}") from error
-
-
-@contextmanager
-def _folder(path: Path) -> Iterator[None]:
-    """A folder that can be written to; a new one does not stay behind empty when something fails."""
-    new = not path.exists()
-    path.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryFile(dir=path):
-        pass
-    sweep(path)
-    try:
-        yield
-    finally:
-        for empty in (path / UNFINISHED, path) if new else ():
-            with suppress(OSError):  # it is not
-                empty.rmdir()

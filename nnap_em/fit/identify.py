@@ -344,8 +344,8 @@ def parameter_table(fitted: Identified) -> dict[str, tuple[float, float]]:
         (value, standard deviation) by name, in the unit of `rig.toml`; empty where all are trusted.
 
     Example:
-        >>> nnap_em.parameter_table(fit)
-        {}
+        >>> list(nnap_em.parameter_table(fit))
+        ['m']
     """
     prior = fitted.m_step.prior
     if not prior.names:

@@ -8,7 +8,7 @@ import dataclasses
 import hashlib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, NoReturn
 
 import equinox as eqx
 import jax
@@ -27,17 +27,11 @@ from ..storage.leaves import describe, name_of, restore, tuples, walk
 from ..systems import systems
 from .identify import Identified, begin
 
-_GIVE = "give the model.npz that `nnap-em identify` wrote"
 MODEL_KIND = Kind(
-    "nnap_em fitted model",
-    4,
-    "model",
-    _GIVE,
-    f"{_GIVE}, from a copy that is whole",
-    "identify again, or use the version that wrote it",
-    "use another copy, or identify again",
-)
-
+    "nnap_em fitted model", 4, "model",
+    give="give the model.npz that `nnap-em identify` wrote",
+    again="identify again, or use the version that wrote it",
+)  # fmt: skip
 
 MODEL_FILE, AFTER_FILE = "model.npz", "after.npz"
 """Files of an identification and of a diagnosis."""
@@ -62,12 +56,8 @@ def model_file(path: Path) -> Path:
 
 def fingerprint(data: Dataset) -> str:
     """SHA-256 of the content of `data`, to recognise the same data later."""
-    digest = hashlib.sha256()
-    for part in data:
-        array = np.ascontiguousarray(part)
-        digest.update(f"{array.dtype.str}{array.shape}".encode())
-        digest.update(array.tobytes())
-    return digest.hexdigest()
+    arrays = [np.asarray(part) for part in data]
+    return hashlib.sha256(b"".join(f"{a.dtype.str}{a.shape}".encode() + a.tobytes() for a in arrays)).hexdigest()
 
 
 def save(
@@ -154,31 +144,27 @@ def _assemble(path: Path, header: Mapping[str, Any], arrays: Mapping[str, np.nda
     rig = _rig(header["rig"])
     if rig.system not in systems:
         refuse(path, f"its system {rig.system!r} is not registered here", f"registered are {', '.join(systems)}")
-    leaves: Mapping[str, Any] = header["leaves"]
     wide = any(array.dtype == np.float64 for array in arrays.values())
     if wide and jnp.zeros(()).dtype != np.float64:
         refuse(path, "its numbers have 64 bits", 'first call jax.config.update("jax_enable_x64", True)')
-    seen = set()
+    leaves: dict[str, dict[str, Any]] = dict(header["leaves"])
 
-    def differs(place: str, problem: str) -> None:
-        versions = f"it was written by nnap_em {header['version']}, this is {__version__}"
-        refuse(
-            path, f"another structure at {place.strip('/')}: {problem} ({versions})", "identify again with this version"
-        )
+    def differs(place: str, problem: str) -> NoReturn:
+        problem = f"another structure at {place.strip('/')}: {problem} (it was written by nnap_em {header['version']}"
+        refuse(path, f"{problem}, this is {__version__})", "identify again with this version")
 
     def leaf(place: str, value: Any) -> Any:
         if place not in leaves:  # a fit may be older than its accuracy
             return value if place == "/accuracy" else differs(place, "missing in the file")
-        seen.add(place)
-        kind, of, array = leaves[place]["is"], leaves[place].get("of"), arrays.get(place)
-        if kind == "code":
-            if name_of(value) != of:
-                differs(place, f"{of!r} in the file")
-        elif kind == "plain":
-            pass
-        elif array is None or callable(value) or (value is not None and kind != "key" and np.ndim(value) != array.ndim):
-            differs(place, "of another shape" if array is not None else "no array in the file")
-        return restore(leaves[place], array, value)
+        entry, array = leaves.pop(place), arrays.get(place)
+        if entry["is"] == "code":
+            if name_of(value) != entry["of"]:
+                differs(place, f"{entry['of']!r} in the file")
+        elif entry["is"] != "plain":
+            axes = None if entry["is"] == "key" or value is None else np.ndim(value)
+            if array is None or callable(value) or axes not in (None, array.ndim):
+                differs(place, "of another shape" if array is not None else "no array in the file")
+        return restore(entry, array, value)
 
     known = {kind.__name__: kind for kind in (*catalogue.values(), *parts)}
     effects = tuple(_drawn(path, sketch, "effect", known) for sketch in header["effects"])
@@ -186,7 +172,7 @@ def _assemble(path: Path, header: Mapping[str, Any], arrays: Mapping[str, np.nda
     tree["smoother"] = _drawn(path, header["smoother"], "smoother", kinds)
     tree = walk(tree, leaf)
     for place, entry in leaves.items():
-        if place not in seen and entry.get("of", entry):  # what is gone and was empty changes nothing
+        if entry.get("of", entry):  # what is gone and was empty changes nothing
             differs(place, "unknown here")
     return Identified(rig=rig, **tree)
 
@@ -219,18 +205,14 @@ def _drawn(path: Path, sketch: Mapping[str, Any], noun: str, known: Mapping[str,
 
 
 def _rig(entries: Mapping[str, Any]) -> Rig:
-    def declared(table: Mapping[str, Any]) -> dict[str, Declared]:
-        return {name: Declared(**pair) for name, pair in table.items()}
-
-    values: dict[str, Any] = {
-        name: tuple(value) if isinstance(value, list) else value for name, value in entries.items()
-    }
+    values: dict[str, Any] = {name: tuples(value) for name, value in entries.items()}
     if not values.get("memory"):  # of a version whose friction could have one
         values.pop("memory", None)
-    values["parameters"], values["start"] = declared(entries["parameters"]), declared(entries["start"])
-    pairs = {part: {name: tuple(pair) for name, pair in table.items()} for part, table in entries["limits"].items()}
-    values["limits"] = Bounds(**pairs)
-    values["ranges"] = {name: tuple(ends) for name, ends in entries["ranges"].items()}
+    for part in ("parameters", "start"):
+        values[part] = {name: Declared(**pair) for name, pair in entries[part].items()}
+    pairs = lambda table: {name: tuple(pair) for name, pair in table.items()}  # noqa: E731
+    values["limits"] = Bounds(**{part: pairs(table) for part, table in entries["limits"].items()})
+    values["ranges"] = pairs(entries["ranges"])
     return Rig(**values)
 
 

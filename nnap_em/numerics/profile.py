@@ -31,7 +31,7 @@ def stage(name: str) -> Iterator[None]:
 
 
 class Profile:
-    """The count and the seconds of every stage of every program so far."""
+    """The seconds of every stage of every program so far."""
 
     def __init__(self) -> None:
         self.spent: dict[str, dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
@@ -44,28 +44,29 @@ class Profile:
             self.spent[name][STAGES[event]].append(duration_secs)
 
     def __str__(self) -> str:
+        named = [(name, [stages[stage] for stage in STAGES.values()]) for name, stages in self.spent.items()]
+        named.sort(key=lambda row: -sum(map(sum, row[1])))
+        every = [[seconds for _, cells in named for seconds in cells[i]] for i in range(len(STAGES))]
+        rows = [(name, cells) for name, cells in named if cells[2] or cells[3]]
+        rows.append((f"all of {len(rows)} names", every))
+        head = "".join(f"{stage + ' s':>10}" for stage in STAGES.values())
+        lines = [f"{'stage or program':32} {'count':>8}{head}"]
+        for name, cells in rows:
+            count = len(cells[2] or cells[3])
+            lines.append(f"{name:32.32} {count:8}" + "".join(f"{sum(cell):10.2f}" for cell in cells))
         elapsed = time.perf_counter() - self._began
-        row = lambda *cells: "{:32.32} {:>8} {:>9} {:>9} {:>9} {:>9}".format(*cells)  # noqa: E731
-        seconds = lambda stages: [f"{sum(stages[stage]):.2f}" for stage in STAGES.values()]  # noqa: E731
-        order = sorted(self.spent.items(), key=lambda one: -sum(map(sum, one[1].values())))
-        programs = [(name, stages) for name, stages in order if stages["compile"] or stages["run"]]
-        every = {stage: [s for _, stages in order for s in stages[stage]] for stage in STAGES.values()}
-        return "\n".join(
-            [
-                row("stage or program", "count", "trace s", "lower s", "compile s", "run s"),
-                *(row(name, len(stages["compile"] or stages["run"]), *seconds(stages)) for name, stages in programs),
-                row(f"all of {len(programs)} names", len(every["compile"]), *seconds(every)),
-                f"{elapsed:.1f} s in all; a program within another is traced with it, and counts in both",
-            ]
-        )
+        lines.append(f"{elapsed:.1f} s in all; a program within another is traced with it, and counts in both")
+        return "\n".join(lines)
 
 
 @contextmanager
-def profiling() -> Iterator[Profile]:
-    """The programs that this process makes inside."""
+def profiling(show: bool = False) -> Iterator[Profile]:
+    """The programs that this process makes inside; `show`: their table is printed at the end, also after a stop."""
     profile = Profile()
     jax.monitoring.register_event_duration_secs_listener(profile)
     try:
         yield profile
     finally:
         jax.monitoring.unregister_event_duration_listener(profile)
+        if show:
+            print(profile)

@@ -9,9 +9,12 @@ kept.
 
 import json
 import logging
+import os
 import sys
 from collections.abc import Callable
-from typing import Any, ClassVar, Protocol, runtime_checkable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -21,29 +24,16 @@ from jax.sharding import Mesh
 from .digest import digest, full_name, surroundings
 
 
-@runtime_checkable
-class Cache(Protocol):
-    """Cache of programs between runs."""
-
-    def get(self, key: str) -> bytes | None:
-        """Entry under this key, if any."""
-        ...
-
-    def put(self, key: str, content: bytes) -> None:
-        """Keep it, if there is room."""
-        ...
-
-
 class _Programs:
     """The cache in use, and the programs made ready in this process; None for one that cannot be kept."""
 
-    cache: ClassVar[Cache | None] = None
+    folder: ClassVar[Path | None] = None
     ready: ClassVar[dict[Any, Callable | None]] = {}
 
 
-def use_cache(cache: Cache | None) -> None:
-    """Keep traced programs in `cache` from here on; None: nowhere, as at first.  Commands do."""
-    _Programs.cache = cache
+def use_cache(folder: Path | None) -> None:
+    """Keep traced programs in this folder from here on; None: nowhere, as at first.  Commands do."""
+    _Programs.folder = folder
 
 
 def traced(run: Callable, function: Callable) -> Callable:
@@ -52,27 +42,27 @@ def traced(run: Callable, function: Callable) -> Callable:
 
     def call(*arguments):
         leaves, structure = jax.tree.flatten(arguments)
-        if _Programs.cache is None or jax.process_count() > 1 or any(isinstance(leaf, Tracer) for leaf in leaves):
+        if _Programs.folder is None or jax.process_count() > 1 or any(isinstance(leaf, Tracer) for leaf in leaves):
             return plain(*arguments)
         known = function, structure, tuple(_shape(leaf) if eqx.is_array(leaf) else leaf for leaf in leaves)
         if known not in _Programs.ready:
-            _Programs.ready[known] = _ready(run, function, arguments, _Programs.cache)
+            _Programs.ready[known] = _ready(run, function, arguments, _Programs.folder)
         program = _Programs.ready[known]
         return plain(*arguments) if program is None else program(*(leaf for leaf in leaves if eqx.is_array(leaf)))
 
     return call
 
 
-def _ready(run: Callable, function: Callable, arguments: Any, cache: Cache) -> Callable | None:
+def _ready(run: Callable, function: Callable, arguments: Any, folder: Path) -> Callable | None:
     """The program, from the cache, or traced and put there; None where it cannot be kept."""
     dynamic, static = eqx.partition(arguments, eqx.is_array)
     arrays, inside = jax.tree.flatten(dynamic)
     try:
-        key = _key(function, arrays, static)
+        path = folder / _key(function, arrays, static)
     except TypeError as error:
         logging.getLogger(__name__).debug("%s is not kept: %s", run.__name__, error)
         return None
-    entry = _unpacked(cache.get(key))
+    entry = _read(path)
     if entry is None:
         structures = []
 
@@ -85,7 +75,7 @@ def _ready(run: Callable, function: Callable, arguments: Any, cache: Cache) -> C
         try:
             exported = jax.export.export(jax.jit(flat), platforms=(jax.export.default_export_platform(),))(*arrays)
             form = _form(jax.tree.unflatten(structures[-1], [0] * structures[-1].num_leaves))
-            cache.put(key, json.dumps(form).encode() + b"\n" + exported.serialize())
+            _write(path, json.dumps(form).encode() + b"\n" + exported.serialize())
         except Exception as error:  # not everything can be written down; a mistake of `run` is raised by `run`
             logging.getLogger(__name__).debug("%s is not kept: %s", run.__name__, error)
             return None
@@ -100,16 +90,26 @@ def _ready(run: Callable, function: Callable, arguments: Any, cache: Cache) -> C
     return lambda *arrays: jax.tree.unflatten(outside, program(*arrays))
 
 
-def _unpacked(content: bytes | None) -> tuple[jax.export.Exported, Any] | None:
-    """Entry of the cache; None for one that is damaged."""
-    if content is None:
-        return None
+def _read(path: Path) -> tuple[jax.export.Exported, Any] | None:
+    """Entry of the cache; None where there is none, or a damaged one."""
     try:
-        form, _, program = content.partition(b"\n")
+        form, _, program = path.read_bytes().partition(b"\n")
         return jax.export.deserialize(bytearray(program)), jax.tree.structure(_tree(json.loads(form)))
     except Exception as error:  # whatever it is that was damaged: it is made anew
-        logging.getLogger(__name__).debug("a kept program cannot be read: %s", error)
+        logging.getLogger(__name__).debug("no kept program: %s", error)
         return None
+
+
+def _write(path: Path, entry: bytes) -> None:
+    """Keep it, whole or not at all, if there is room."""
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    with suppress(OSError):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            part.write_bytes(entry)
+            part.replace(path)
+        finally:
+            part.unlink(missing_ok=True)
 
 
 def _form(tree: Any) -> Any:

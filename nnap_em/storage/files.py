@@ -1,6 +1,5 @@
-"""Files that are there whole or not at all: texts, bytes, and arrays under a JSON header with a checksum."""
+"""Files that are there whole or not at all: texts, bytes, and arrays under a JSON header."""
 
-import hashlib
 import io
 import json
 import os
@@ -29,13 +28,9 @@ class Kind(NamedTuple):
     format: int
     noun: str
     give: str
-    """The hint for a file of another program."""
-    whole: str
-    """The hint for a file that is cut short."""
+    """The hint for a file that is not of this kind, or not whole."""
     again: str
     """The hint for a file of another format."""
-    copy: str
-    """The hint for a file whose checksum does not hold."""
 
 
 def cores() -> int:
@@ -114,40 +109,19 @@ def whole_folder(out: Path) -> Iterator[Path]:
 def sweep(folder: Path) -> None:
     """Remove from `folder` what killed processes left half written."""
     for part in folder.glob(".*.part"):
-        number = part.name.split(".")[-2]
-        if number.isdigit() and not _alive(int(number)):
-            part.unlink(missing_ok=True)
-
-
-def _alive(process: int) -> bool:
-    """True where another process has this number."""
-    if process == os.getpid():  # in a container all first processes have one number
-        return False
-    try:
-        os.kill(process, 0)
-    except ProcessLookupError:
-        return False
-    except OSError:
-        return True
-    return True
+        part.unlink(missing_ok=True)
 
 
 def write_arrays(path: Path, kind: Kind, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> None:
     """Write `arrays` and a header to one npz file, whole or not at all."""
     full = {"kind": kind.name, "format": kind.format, "version": __version__, **header}
-    text = json.dumps(full).encode()
     content = io.BytesIO()
-    np.savez(
-        content,
-        allow_pickle=False,
-        **{"header": np.frombuffer(text, np.uint8), "sha256": _checksum(text, arrays)},
-        **arrays,
-    )
+    np.savez(content, allow_pickle=False, header=np.frombuffer(json.dumps(full).encode(), np.uint8), **arrays)
     replace_bytes(path, content.getvalue())
 
 
 def read_arrays(path: Path, kind: Kind) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Header and arrays of a file of this kind and format whose checksum holds.
+    """Header and arrays of a file of this kind and format; the checksums of zip show damaged bytes.
 
     Raises StoreError for any other.
     """
@@ -155,32 +129,21 @@ def read_arrays(path: Path, kind: Kind) -> tuple[dict[str, Any], dict[str, np.nd
         content = path.read_bytes()
     except OSError as error:
         refuse(path, f"cannot be read ({error.strerror})", kind.give)
-    arrays: dict[str, np.ndarray] = {}
     try:
         with np.load(io.BytesIO(content), allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
-        text = arrays.pop("header").tobytes()
-        header = json.loads(text)
+        header = json.loads(arrays.pop("header").tobytes())
     except Exception:  # what the parsers raise on damaged bytes is open-ended
-        refuse(path, f"no {kind.noun}, or damaged or cut short ({len(content)} bytes)", kind.whole)
+        problem = f"no {kind.noun}, or damaged or cut short ({len(content)} bytes)"
+        refuse(path, problem, f"{kind.give}, from a copy that is whole")
     if not isinstance(header, dict) or header.get("kind") != kind.name:
         refuse(path, "an npz of another program", kind.give)
     if header.get("format") != kind.format:
         by = f"format {header.get('format')} (nnap_em {header.get('version')}), this version reads format {kind.format}"
         refuse(path, by, kind.again)
-    if not np.array_equal(arrays.pop("sha256", np.zeros(0)), _checksum(text, arrays)):
-        refuse(path, "damaged: its checksum does not hold", kind.copy)
     return header, arrays
 
 
 def refuse(path: Path, problem: str, hint: str) -> NoReturn:
     """Raise StoreError."""
     raise StoreError(f"{path}: {problem}; {hint}")
-
-
-def _checksum(header: bytes, arrays: Mapping[str, np.ndarray]) -> np.ndarray:
-    digest = hashlib.sha256(header)
-    for name in sorted(arrays):
-        digest.update(f"{name}{arrays[name].dtype.str}{arrays[name].shape}".encode())
-        digest.update(np.ascontiguousarray(arrays[name]).tobytes())
-    return np.frombuffer(digest.digest(), np.uint8)

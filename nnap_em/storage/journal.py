@@ -12,7 +12,6 @@ damaged, or differs in one bit, is computed anew.  Outside `keeping` nothing of 
 import contextlib
 import contextvars
 import functools
-import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, TypeVar
@@ -26,7 +25,7 @@ from .deadline import in_time
 from .files import Kind, StoreError, read_arrays, sweep, write_arrays
 from .leaves import describe, name_of, restore
 
-STEP_KIND = Kind("nnap_em finished step", 2, "finished step", *4 * ["it is done again"])
+STEP_KIND = Kind("nnap_em finished step", 2, "finished step", *2 * ["it is done again"])
 HERE: Any = object()
 """Stands for one array or number in the form of an outcome."""
 
@@ -47,8 +46,7 @@ class Journal:
     @property
     def files(self) -> list[Path]:
         """Finished steps of any computation."""
-        own = re.compile(r"[a-z_]+-[0-9a-f]{32}\.npz")
-        return [path for path in self.folder.glob("*.npz") if own.fullmatch(path.name)]
+        return list(self.folder.glob(f"*-{32 * '?'}.npz"))
 
     def clear(self) -> None:
         """Remove the finished steps, and the folder if nothing else is in it."""
@@ -64,10 +62,9 @@ class Journal:
             header, arrays = read_arrays(self.folder / f"{name}.npz", STEP_KIND)
         except StoreError:  # none, or damaged
             return None
-        entries = header["leaves"]
         blanks, structure = jax.tree.flatten(form)
         self.done.add(name)
-        leaves = enumerate(zip(entries, blanks, strict=True))
+        leaves = enumerate(zip(header["leaves"], blanks, strict=True))
         return jax.tree.unflatten(structure, [restore(e, arrays.get(str(i)), blank) for i, (e, blank) in leaves])
 
     def keep(self, name: str, outcome: Any) -> None:

@@ -70,32 +70,23 @@ def watch(children: list[subprocess.Popen], first: int) -> int:
                 time.sleep(1.0)  # so that the message of the one that died is out
                 break
             time.sleep(0.05)
-        return _blame(children, first) if any(child.returncode for child in children) else 0
+        failed = [(first + i, code) for i, child in enumerate(children) if (code := child.poll())]
+        if not failed or (children[0].returncode or 0) > 0:
+            return children[0].returncode or 0  # the first one has reported the reason
+        index, code = failed[0]
+        cause = f"was killed by {signal.Signals(-code).name}" if code < 0 else f"ended with status {code}"
+        kept = "the others were ended. What was finished is kept: give the same command again"
+        print(f"error: process {index} {cause}; {kept}", file=sys.stderr)
+        return 1
     except KeyboardInterrupt:  # a terminal sends it to the children, too
         with suppress(subprocess.TimeoutExpired):
             children[0].wait(farewell)
-        raise
+        return 130
     finally:
         for child in children:
             if child.poll() is None:
                 child.kill()
             child.wait()
-
-
-def _blame(children: list[subprocess.Popen], first: int) -> int:
-    codes = [child.poll() for child in children]
-    if codes[0] and codes[0] > 0:
-        return codes[0]  # it has reported the reason
-    index = next(i for i, code in enumerate(codes) if code)
-    code = codes[index]
-    assert code is not None
-    cause = f"was killed by {signal.Signals(-code).name}" if code < 0 else f"ended with status {code}"
-    print(
-        f"error: process {first + index} {cause}; the others were ended. What was finished is kept: "
-        "give the same command again",
-        file=sys.stderr,
-    )
-    return 1
 
 
 def main() -> None:
@@ -119,10 +110,9 @@ def main() -> None:
     if args.coordinator and not args.here:
         arguments.error("--coordinator needs --here N: processes on this machine")
     local = args.here or args.processes
-    if not 0 < local <= args.processes - args.first:
-        arguments.error(
-            f"processes {args.first} to {args.first + local - 1} of {args.processes}: check --first, --here"
-        )
+    last = args.first + local - 1
+    if not args.first <= last < args.processes:
+        arguments.error(f"processes {args.first} to {last} of {args.processes}: check --first, --here")
     threads = max(1, cores() // local)
     address = args.coordinator or free_address()
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -133,10 +123,7 @@ def main() -> None:
     for index in range(args.first, args.first + local):
         order = ["--coordinator", address, "--work", str(index), str(threads), str(args.processes), *args.command]
         children.append(subprocess.Popen([sys.executable, "-m", "nnap_em.launch", *order]))
-    try:
-        sys.exit(watch(children, args.first))
-    except KeyboardInterrupt:
-        sys.exit(130)
+    sys.exit(watch(children, args.first))
 
 
 if __name__ == "__main__":

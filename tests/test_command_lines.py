@@ -1,8 +1,6 @@
-"""Every command line that the documentation, the help and messages show is parsed and run, in its cheapest form.
+"""Every command line that the documentation and the help show is parsed, and every option runs, in its cheapest form.
 
-A line is known by its command and its set of options: each such set, and each option of the parser that no line shows,
-runs once on a small slide, with values of `VALUES`.  The engines that need minutes are replaced by what a fit already
-gave; their own tests run them.
+The engines that need minutes are replaced by what a fit already gave; their own tests run them.
 """
 
 import argparse
@@ -13,6 +11,7 @@ import re
 import shlex
 import shutil
 import subprocess
+from collections.abc import Iterator
 
 import h5py
 import jax
@@ -37,137 +36,62 @@ from nnap_em.systems import specs
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 LAUNCH = "python -m nnap_em.launch"
 
-PLACES = {
-    "simulate": ["new"],
-    "init": ["log.csv"],
-    "import": ["one.h5", "two.h5"],
-    "check": ["bench"],
-    "identify": ["bench"],
-    "diagnose": ["bench"],
-    "design": ["fit"],
-    "compare": ["fit", "other"],
-    "predict": ["fit", "bench/test"],
-    "smooth": ["fit", "bench/test"],
-    "export": ["fit"],
+EVERY = "--seed 1 --quiet --profile --trust-readings"
+RUNS: dict[str, tuple[str, ...]] = {
+    "simulate DIR/new --system slide --sequences 2 --test 1 --steps 60 --seed 1 --measured x"
+    " --process-noise 0.001 0.01 --measurement-noise 0.001 0.01": (),
+    "init log.csv --system slide --out DIR": (),
+    "init log.csv --model equations --out DIR": (),
+    "import one.h5 two.h5 --rig bench/rig.toml --out DIR/new --test 1 --shift /drive=0.0 --unwrap x": (),
+    "check bench --trust-readings": (),
+    "identify bench --out DIR": ("model.npz", "report.json", "friction.csv", "friction.png"),
+    f"identify bench --out DIR --more february --smoother particle --particles 9 --epochs 3 {EVERY}": (),
+    "identify bench --out DIR --from january": (),
+    "diagnose bench --out DIR": ("after.npz", "friction_before.csv"),
+    f"diagnose bench --out DIR --from january --logs bench --more february --minutes 1 {EVERY}": (),
+    f"design fit --out DIR --for friction --seconds 1.2 --sequences 2 --logs bench {EVERY}": (),
+    "design fit --out DIR": ("design.json", "inputs/1.csv", "motion/6.csv"),
+    "compare fit other --out DIR": ("compare.html",),
+    "predict fit bench/test --given 0.1 --out DIR --seed 1 --trust-readings": ("000.csv",),
+    "smooth fit bench/test --out DIR --trust-readings": ("000.csv",),
+    "export fit --out DIR": ("parameters.json",),
+    "export fit --c DIR/arm.c": ("arm.c",),
+    "export fit --observer DIR/arm.c --float": ("arm.c", "arm.h"),
+    "export rod --mjcf DIR/rod.xml": ("rod.xml",),
+    "export rod --urdf DIR/rod.urdf": ("rod.urdf",),
 }
-"""Places that a command is given, in the folder of the fits."""
-VALUES: dict[str, list[str]] = {
-    "--system": ["slide"],
-    "--sequences": ["2"],
-    "--test": ["1"],
-    "--steps": ["60"],
-    "--seed": ["1"],
-    "--measured": ["x"],
-    "--process-noise": ["0.001", "0.01"],
-    "--measurement-noise": ["0.001", "0.01"],
-    "--model": ["equations"],
-    "--rig": ["bench/rig.toml"],
-    "--shift": ["/drive=0.0"],
-    "--unwrap": ["x"],
-    "--more": ["february"],
-    "--from": ["january"],
-    "--smoother": ["particle"],
-    "--particles": ["9"],
-    "--epochs": ["3"],
-    "--minutes": ["1"],
-    "--logs": ["bench"],
-    "--for": ["friction"],
-    "--seconds": ["1.2"],
-    "--given": ["0.1"],
-    "--mjcf": ["{out}.xml"],
-    "--urdf": ["{out}.urdf"],
-    "--c": ["{out}.c"],
-    "--observer": ["{out}.c"],
-    "--out": ["{out}"],
-}
-"""Cheap values of options; `{out}` is a name that is new in each run."""
-GOES_WITH = {
-    ("identify", "--particles"): "--smoother",
-    ("diagnose", "--logs"): "--from",
-    ("export", "--float"): "--observer",
-}
-"""Options that are refused without another."""
-INSTEAD = {("init", "--system"): "--model", ("init", "--model"): "--system"}
-"""Options of which a run may have one."""
-
-
+"""Lines in the folder of the fits, and files in DIR that they write."""
 PARSER = cli.parser()
+COMMANDS = next(a for a in PARSER._actions if isinstance(a, argparse._SubParsersAction)).choices
 
 
-def _parsers() -> dict[str, argparse.ArgumentParser]:
-    return next(a for a in PARSER._actions if isinstance(a, argparse._SubParsersAction)).choices
-
-
-@functools.cache
-def _options(command: str) -> dict[str, argparse.Action]:
-    actions = _parsers()[command]._actions
-    return {a.option_strings[-1]: a for a in actions if a.option_strings and a.dest != "help"}
-
-
-def _required(command: str) -> frozenset[str]:
-    return frozenset(name for name, action in _options(command).items() if action.required)
-
-
-def _lines() -> list[tuple[str, list[str]]]:
-    """Whole command lines: in fenced blocks of pages and under the examples of a help text; where, and the words."""
-    out = []
+def _shown() -> Iterator[tuple[str, list[str]]]:
+    """Whole command lines in fenced blocks of pages and under the examples of a help text: where, and the words."""
     for page in PAGES:
         for number, line in enumerate(page.read_text().splitlines(), 1):
             if line.startswith(("nnap-em ", LAUNCH)):
-                out.append((f"{page.name}:{number}", shlex.split(line, comments=True)))
-    for name, parser in {"nnap-em": PARSER, **_parsers()}.items():
+                yield f"{page.name}:{number}", shlex.split(line, comments=True)
+    for name, parser in {"nnap-em": PARSER, **COMMANDS}.items():
         for line in (parser.epilog or "").splitlines():
             if line.startswith("  nnap-em "):
-                out.append((f"{name} --help", shlex.split(re.split(r"\s{2,}", line.strip())[0])))
-    return out
-
-
-def _command(words: list[str]) -> list[str]:
-    """The words after `nnap-em`, also of a line of `launch`."""
-    if words[0] == "nnap-em":
-        return words[1:]
-    return words[next(i for i, word in enumerate(words) if word in PLACES) :]
-
-
-SHOWN = [(where, _command(words)) for where, words in _lines()]
-
-
-def _given(words: list[str]) -> tuple[str, frozenset[str]]:
-    return words[0], frozenset(word for word in words[1:] if word.startswith("--"))
-
-
-def _sets() -> dict[tuple[str, frozenset[str]], str]:
-    """Each distinct command with its options, and where it is shown; options that no line shows, together."""
-    out = {_given(words): where for where, words in reversed(SHOWN)}
-    for command in _parsers():
-        shown = frozenset().union(*(options for name, options in out if name == command))
-        rest = {option for option in _options(command) if option not in shown}
-        rest |= {GOES_WITH[command, option] for option in rest if (command, option) in GOES_WITH}
-        others = {option for option in rest if INSTEAD.get((command, option)) in rest}
-        for option in sorted(others)[1:]:  # by itself
-            out[command, _required(command) | {option}] = "the parser"
-            rest.discard(option)
-        if rest:
-            out[command, _required(command) | rest] = "the parser"
-    return out
-
-
-SETS = _sets()
+                yield f"{name} --help", shlex.split(re.split(r"\s{2,}", line.strip())[0])
 
 
 def test_every_line_that_is_shown_is_accepted_by_the_parser(capsys):
-    assert len(SHOWN) > 50
-    for where, words in SHOWN:
+    shown = [*_shown()]
+    assert len(shown) > 50
+    for where, words in shown:
         try:
-            PARSER.parse_args(words)
+            PARSER.parse_args(words[next(i for i, word in enumerate(words) if word in COMMANDS) :])
         except SystemExit:
             pytest.fail(f"{where}: {shlex.join(words)}: {capsys.readouterr().err}")
 
 
 def test_every_option_of_the_parser_runs():
-    for command in _parsers():
-        run = frozenset().union(*(options for name, options in SETS if name == command))
-        assert run == {*_options(command)}, command
+    for command, parser in COMMANDS.items():
+        options = {a.option_strings[-1] for a in parser._actions if a.option_strings} - {"--help"}
+        words = {word for line in RUNS if line.startswith(command) for word in line.split()}
+        assert options == {word for word in words if word.startswith("--")}, command
 
 
 @pytest.fixture(scope="module")
@@ -177,7 +101,7 @@ def place(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(root)
         for seed, name in enumerate(("bench", "february")):
-            size = ("--sequences", 2, "--test", 1, "--steps", 60, "--seed", seed)
+            size = ("--sequences", 2, "--test", 1, "--steps", 95, "--seed", seed)
             assert nnap("simulate", name, "--system", "slide", *size) == 0
         (root / "log.csv").write_text((root / "bench/train/000.csv").read_text())
         for i, name in enumerate(("one", "two")):
@@ -257,35 +181,30 @@ def light(place, beside, designed, fit, monkeypatch):
     return place
 
 
-def _argv(command: str, options: frozenset[str], out: str) -> list[str]:
-    argv = [command, *PLACES[command]]
-    if command == "export" and options & {"--mjcf", "--urdf"}:
-        argv[1] = "rod"
-    for option in sorted(options):
-        action = _options(command)[option]
-        flag = action.nargs == 0
-        assert flag or option in VALUES, f"{command} {option}: give it a cheap value in VALUES"
-        argv += [option, *([] if flag else [value.format(out=f"{out}{option}") for value in VALUES[option]])]
-    if command == "simulate":
-        argv[1] = out
-        argv += [word for name in ("--system", "--sequences", "--test", "--steps") if name not in options
-                 for word in (name, *VALUES[name])]  # fmt: skip
-    if command == "init" and "--out" not in options:
-        argv += ["--out", f"{out}--out"]  # that of the log is filled in once
-    if command == "design":
-        argv += [word for name in ("--seconds", "--sequences") if name not in options for word in (name, *VALUES[name])]
-    return argv
+@pytest.mark.parametrize("line", RUNS)
+def test_it_runs_and_replaces_files_of_its_own(line, light, tmp_path, capsys):
+    for _ in range(2 if line.startswith(("compare", "predict", "smooth", "export")) else 1):
+        assert cli.main(line.replace("DIR", str(tmp_path)).split()) == 0, capsys.readouterr().err
 
 
-@pytest.mark.parametrize("given", SETS, ids=[f"{name} {' '.join(sorted(options))}".strip() for name, options in SETS])
-def test_it_runs(given, light, capsys):
-    command, options = given
-    out = f"out{list(SETS).index(given)}"
-    argv = _argv(command, options, out)
-    assert cli.main(argv) == 0, (SETS[given], capsys.readouterr().err)
+@pytest.mark.parametrize("line, file", [(line, file) for line, files in RUNS.items() for file in files])
+def test_a_file_of_somebody_else_is_never_replaced(line, file, light, tmp_path, capsys):
+    """Refused before anything else is written."""
+    mine = tmp_path / file
+    mine.parent.mkdir(exist_ok=True)
+    mine.write_text("time,u\n0.0,1.0\n")
+    assert cli.main(line.replace("DIR", str(tmp_path)).split()) == 2
+    assert f"{mine}: is there already, and nnap_em did not write it" in capsys.readouterr().err
+    assert mine.read_text() == "time,u\n0.0,1.0\n"
+    assert [path for path in tmp_path.rglob("*") if path.is_file()] == [mine]
 
 
-# --- what was wrong in such lines
+def test_a_fit_is_replaced_by_another(light, tmp_path, capsys):
+    shutil.copytree(light / "other", tmp_path / "fit")
+    before = (tmp_path / "fit/model.npz").read_bytes()
+    assert nnap("identify", "bench", "--out", tmp_path / "fit") == 0
+    assert f"nnap-em: the fit in {tmp_path}/fit will be replaced" in capsys.readouterr().err.splitlines()
+    assert (tmp_path / "fit/model.npz").read_bytes() != before
 
 
 def test_a_file_that_is_no_log_is_refused_in_one_line(light, capsys):
@@ -301,50 +220,12 @@ def test_the_source_of_an_observer_includes_the_header_that_is_written(light, tm
 
 
 def test_a_design_is_as_long_in_python_as_by_the_command():
-    parameters = inspect.signature(experiment.design).parameters
-    for option, name in (("--seconds", "seconds"), ("--sequences", "sequences"), ("--for", "question")):
-        assert _options("design")[option].default == parameters[name].default
-
-
-# --- files of others
-
-PLACED = {
-    "identify bench --out DIR": ("model.npz", "report.json", "friction.csv", "friction.png"),
-    "diagnose bench --out DIR": ("after.npz", "friction_before.csv"),
-    "design fit --out DIR": ("design.json", "inputs/1.csv", "motion/6.csv"),
-    "compare fit other --out DIR": ("compare.html",),
-    "predict fit bench/test --given 0.1 --out DIR": ("000.csv",),
-    "smooth fit bench/test --out DIR": ("000.csv",),
-    "export fit --out DIR": ("parameters.json",),
-    "export fit --c DIR/arm.c": ("arm.c",),
-    "export fit --observer DIR/arm.c": ("arm.c", "arm.h"),
-    "export rod --mjcf DIR/rod.xml": ("rod.xml",),
-    "export rod --urdf DIR/rod.urdf": ("rod.urdf",),
-}
-
-
-@pytest.mark.parametrize("line, file", [(line, file) for line, files in PLACED.items() for file in files])
-def test_a_file_of_somebody_else_is_never_replaced(line, file, light, tmp_path, capsys):
-    """Refused before anything else is written."""
-    mine = tmp_path / file
-    mine.parent.mkdir(exist_ok=True)
-    mine.write_text("time,u\n0.0,1.0\n")
-    assert cli.main(line.replace("DIR", str(tmp_path)).split()) == 2
-    assert f"{mine}: is there already, and nnap_em did not write it" in capsys.readouterr().err
-    assert mine.read_text() == "time,u\n0.0,1.0\n"
-    assert [path for path in tmp_path.rglob("*") if path.is_file()] == [mine]
-
-
-def test_files_of_its_own_are_replaced(light, tmp_path, capsys):
-    for line in PLACED:
-        if not line.startswith(("identify", "diagnose", "design")):
-            for _ in range(2):
-                assert cli.main(line.replace("DIR", str(tmp_path)).split()) == 0
-    shutil.copytree(light / "other", tmp_path / "fit")
-    before = (tmp_path / "fit/model.npz").read_bytes()
-    assert nnap("identify", "bench", "--out", tmp_path / "fit") == 0
-    assert f"nnap-em: the fit in {tmp_path}/fit will be replaced" in capsys.readouterr().err.splitlines()
-    assert (tmp_path / "fit/model.npz").read_bytes() != before
+    parameters, args = (
+        inspect.signature(experiment.design).parameters,
+        PARSER.parse_args(["design", "fit", "--out", "x"]),
+    )
+    for option, name in (("seconds", "seconds"), ("sequences", "sequences"), ("for", "question")):
+        assert getattr(args, option) == parameters[name].default
 
 
 def test_a_design_replaces_the_older_one_and_no_other_table(light, tmp_path):

@@ -242,61 +242,6 @@ def test_a_search_that_is_killed_stopped_and_out_of_time_goes_on_to_the_same_num
     assert [effect["name"] for effect in left["report"]["effects"]] == ["torsional_spring"]
 
 
-# --- files that are not what they should be
-
-
-@pytest.fixture(scope="module")
-def stopped(rig) -> Path:
-    """Folder of a run that was killed after its fifth step."""
-    out = rig.parent / "stopped"
-    with pytest.MonkeyPatch.context() as patch, pytest.raises(Killed):
-        _toys(patch, rig)
-        patch.setattr(files, "replace_bytes", _faulty("after a write", 5))
-        cli.main(_order("identify", rig, out, "--quiet"))
-    return out
-
-
-def _flipped(content: bytes) -> bytes:
-    """One bit of the numbers, which stand before the directory of the zip."""
-    place = content.rindex(b"PK\x01\x02", 0, content.rindex(b"PK\x01\x02")) - 8
-    return content[:place] + bytes([content[place] ^ 1]) + content[place + 1 :]
-
-
-DAMAGED = {
-    "whole": (lambda content: content, 7),
-    "empty": (lambda content: b"", 8),
-    "truncated": (lambda content: content[: len(content) // 2], 8),
-    "almost whole": (lambda content: content[:-1], 8),
-    "text": (lambda content: b"time,u\n0,1\n", 8),
-    "a bit": (_flipped, 8),
-}
-"""What happens to one of five finished steps, and how many of twelve are done then."""
-
-
-def _goes_on(rig: Path, out: Path, monkeypatch) -> int:
-    """Steps that are written until the end; the numbers are right."""
-    written, keep = [], Journal.keep
-    _toys(monkeypatch, rig)
-    monkeypatch.setattr(Journal, "keep", lambda *of: (written.append(of[1]), keep(*of))[1])
-    assert cli.main(_order("identify", rig, out)) == 0
-    assert json.loads((out / "report.json").read_text())["log_likelihood"][0] == pytest.approx(_toy_after(12))
-    return len(written)
-
-
-@pytest.mark.parametrize("change, done", DAMAGED.values(), ids=DAMAGED)
-def test_a_step_that_is_damaged_is_done_again(rig, stopped, tmp_path, monkeypatch, change, done):
-    out = Path(shutil.copytree(stopped, tmp_path / "out"))
-    first = min(out.glob("unfinished/*.npz"))
-    first.write_bytes(change(first.read_bytes()))
-    assert _goes_on(rig, out, monkeypatch) == done
-
-
-def test_steps_of_another_version_are_done_again(rig, stopped, tmp_path, monkeypatch):
-    out = Path(shutil.copytree(stopped, tmp_path / "out"))
-    monkeypatch.setattr(journal, "surroundings", lambda: "after an edit")
-    assert _goes_on(rig, out, monkeypatch) == 12
-
-
 def test_a_folder_that_cannot_be_is_refused_before_the_work(rig, tmp_path, capsys):
     (tmp_path / "file").write_text("")
     assert cli.main(_order("identify", rig, tmp_path / "file" / "out")) == 2
@@ -337,6 +282,42 @@ def test_ctrl_c_that_a_garbage_collection_swallows_stops_at_the_next_line(tmp_pa
 
 
 # --- the journal itself
+
+
+def _flipped(content: bytes) -> bytes:
+    """One bit of the numbers, which stand before the directory of the zip."""
+    place = content.rindex(b"PK\x01\x02", 0, content.rindex(b"PK\x01\x02")) - 8
+    return content[:place] + bytes([content[place] ^ 1]) + content[place + 1 :]
+
+
+DAMAGED = {
+    "whole": lambda content: content,
+    "empty": lambda content: b"",
+    "truncated": lambda content: content[: len(content) // 2],
+    "almost whole": lambda content: content[:-1],
+    "text": lambda content: b"time,u\n0,1\n",
+    "a bit": _flipped,
+}
+"""What happens to a finished step."""
+
+
+def test_a_step_that_is_damaged_or_of_another_version_is_done_again(tmp_path, monkeypatch):
+    written, keep = [], Journal.keep
+    monkeypatch.setattr(Journal, "keep", lambda *of: (written.append(of[1]), keep(*of))[1])
+
+    def done() -> int:
+        written.clear()
+        with keeping(Journal(tmp_path)):
+            assert _steps_of_a_toy()[0] == pytest.approx(_toy_after(12))
+        return len(written)
+
+    assert done() == 12
+    for name, change in DAMAGED.items():
+        first = min(tmp_path.glob("*.npz"))
+        first.write_bytes(change(first.read_bytes()))
+        assert done() == (name != "whole"), name
+    monkeypatch.setattr(journal, "surroundings", lambda: "after an edit")
+    assert done() == 12
 
 
 def _twice(counts: dict):

@@ -61,43 +61,10 @@ print(seen)
 
 
 def test_devices_of_ones_own_number_are_used_where_they_have_work():
-    """Five sequences on four devices are two for each of three."""
+    """Five sequences on four devices are two for each of three; numbers are those of one device."""
     environment = {**ENVIRONMENT, "JAX_NUM_CPU_DEVICES": "4"}
     done = subprocess.run([sys.executable, "-c", OWN_DEVICES], env=environment, capture_output=True, text=True)
     assert done.stdout == "[1, 3, 3, 4]\n", done.stderr
-
-
-DEVICES = """
-import sys
-import jax
-jax.config.update("jax_enable_x64", True)
-jax.config.update("jax_num_cpu_devices", 4)
-import equinox as eqx
-import numpy as np
-from nnap_em.em.loop import fit
-from nnap_em.fit.identify import begin
-from nnap_em.numerics.parallel import AXIS, over
-from nnap_em.data.logs import read_logs
-from nnap_em.data.rig import read_rig
-from nnap_em.smoother.gaussian import CubatureSmoother, GaussianSmoother
-from nnap_em.systems import specs
-from pathlib import Path
-folder = Path(sys.argv[1])
-rig = read_rig(folder / "rig.toml", specs)
-data = read_logs(folder / "train", rig).data
-now = begin(rig, data, key=jax.random.key(0))
-def run(count):
-    mesh = jax.sharding.Mesh(np.array(jax.devices()[:count]), (AXIS,))
-    with over(mesh):
-        state = fit(now.state, data, CubatureSmoother(now.bank), now.m_step, epochs=2)
-    arrays = eqx.filter((state.best, state.hessian, state.loglik), eqx.is_array_like)
-    return np.concatenate([np.ravel(a) for a in jax.tree.leaves(arrays)])
-one = run(1)
-# sums in another order: 1e-11 after two epochs, of which the second's prior has the shape of the first's friction
-np.testing.assert_allclose(run(4), one, rtol=1e-9, atol=1e-9)
-GaussianSmoother.room = 1
-np.testing.assert_allclose(run(4), one, rtol=1e-9, atol=1e-9)
-"""
 
 
 @pytest.fixture(scope="module")
@@ -117,12 +84,6 @@ def _launched(*order: object, **options) -> Iterator[subprocess.Popen]:
         yield run
     finally:
         run.kill()
-
-
-@pytest.mark.slow  # fast: test_groups_and_a_mesh_change_nothing
-def test_devices_agree(rig):
-    """Five sequences over 1 and 4 devices, and one at a time."""
-    subprocess.run([sys.executable, "-c", DEVICES, str(rig)], env=ENVIRONMENT, check=True, timeout=600)
 
 
 def _numbers(out: Path) -> dict[str, np.ndarray]:

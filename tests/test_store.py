@@ -235,25 +235,25 @@ def _other_code(header, arrays):
     header["leaves"][code]["of"] = "relu"
 
 
-MISFITS = {
-    "format": (
-        lambda header, _: header.update(format=0, version="0.0.1"),
-        r"format 0 \(nnap_em 0\.0\.1\), this version reads format 4",
+OTHER_VERSIONS = [
+    (
+        lambda header, _: header.update(format=0, version="0.1"),
+        r"format 0 \(nnap_em 0\.1\), this version reads format 4",
     ),
-    "newer": (lambda header, _: header.update(format=5), "format 5"),
-    "system": (lambda header, _: header["rig"].update(system="crane"), "'crane' is not registered"),
-    "header": (lambda header, _: header.pop("notes"), "lacks something"),
-    "rig": (lambda header, _: header["rig"].pop("dt"), "lacks something"),
-    "shape": (_wrong_shape, "state/model/log_q: of another shape"),
-    "lost array": (_lost_array, "state/model/log_q: missing in the file"),
-    "spare array": (_spare_array, "state/model/extra: unknown here"),
-    "code": (_other_code, "'relu' in the file"),
-}
+    (lambda header, _: header.update(format=5), "format 5"),
+    (lambda header, _: header["rig"].update(system="crane"), "'crane' is not registered"),
+    (lambda header, _: header.pop("notes"), "lacks something"),
+    (lambda header, _: header["rig"].pop("dt"), "lacks something"),
+    (_wrong_shape, "state/model/log_q: of another shape"),
+    (_lost_array, "state/model/log_q: missing in the file"),
+    (_spare_array, "state/model/extra: unknown here"),
+    (_other_code, "'relu' in the file"),
+]
 
 
 def test_a_file_of_another_version_is_refused(file):
     whole = file.read_bytes()
-    for change, reason in MISFITS.values():
+    for change, reason in OTHER_VERSIONS:
         file.write_bytes(whole)
         _rewrite(file, change)
         with pytest.raises(StoreError, match=rf"model\.npz: .*{reason}.*; (identify again|registered are)"):

@@ -170,8 +170,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
         # XLA takes tuning hints of its own for features of a processor, and logs an error for each kept program.
         os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # [github.com/openxla/xla/issues/44565]
-        from ..numerics.profile import profiling
-        from . import common  # loads JAX
+        from ..numerics.profile import profiling  # loads JAX
+        from . import common
 
         with warnings.catch_warnings(), _stoppable(silent if getattr(args, "quiet", False) else _log) as log:
             warnings.showwarning = _warn

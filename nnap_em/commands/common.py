@@ -4,34 +4,32 @@ import argparse
 import os
 import tempfile
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
-from ..comparison.compare import CompareError
+from .. import errors
 from ..data.dataset import DataError, Dataset
 from ..data.formats import has_logs, header, write_csv
 from ..data.logs import DataWarning, Logs, check_split, read_logs, together
-from ..data.rig import Rig, RigError, RigWarning, read_rig
+from ..data.rig import Rig, RigError, read_rig
 from ..em.build import build_system, measure_scales
 from ..em.equations import infinite_rates
-from ..em.loop import FitError
-from ..experiment.limits import DesignError
-from ..export.model import ExportError
 from ..fit.check import ERROR, WARNING, rates, torques
+from ..fit.identify import Identified
 from ..fit.known import differences
 from ..fit.predict import GIVEN
-from ..fit.store import AFTER_FILE, MODEL_FILE, Stored, fingerprint, model_file, read
+from ..fit.store import AFTER_FILE, MODEL_FILE, Stored, fingerprint, model_file, read, save
 from ..numerics.digits import counted
 from ..numerics.parallel import use_every_device
 from ..numerics.programs import use_older_emitters
 from ..numerics.traced import use_cache
 from ..report.tables import FRICTION
-from ..storage.files import StoreError, check_own, cores, sweep
+from ..storage.files import check_own, cores, sweep
 from ..storage.journal import Journal, keeping
 from ..storage.log import Log
 from ..systems import specs
@@ -41,8 +39,9 @@ class Halted(RuntimeError):
     """A file could not be written: the message names it, the steps that are kept, and the way to continue."""
 
 
-MISTAKES = (RigError, DataError, StoreError, FitError, CompareError, DesignError, ExportError, Halted)
-WARNINGS = (RigWarning, DataWarning)
+_PUBLIC = [getattr(errors, name) for name in errors.__all__]
+WARNINGS = tuple(kind for kind in _PUBLIC if issubclass(kind, Warning))
+MISTAKES = (Halted, *(kind for kind in _PUBLIC if kind not in WARNINGS))
 REPORTS = ("report.json", "report.html")
 MISFIT_STATUS = 3
 """Exit status of a fit that does not describe the motion."""
@@ -112,19 +111,15 @@ def read_training(rig: Rig, folders: Sequence[Path], trust: bool) -> Logs:
     return together(parts)
 
 
-def logs_at(args: argparse.Namespace) -> list[str]:
-    """The folders of the training logs, as they are found from any other."""
-    return [str(folder.resolve()) for folder in (args.folder, *args.more)]
-
-
 def logs_of(file: Path, stored: Stored, folders: Sequence[Path], trust: bool) -> tuple[Rig, Logs]:
     """Rig and training logs of the fit in `file`: of these folders, or of those that it names.
 
     Raises DataError where they are not there, or are others.
     """
     folders = folders or list(map(Path, stored.notes.get("logs", [])))
-    if gone := [folder for folder in folders if not folder.is_dir()] or not folders:
-        problem = f"its logs are not at {gone[0]}" if folders else "it does not say where its logs are"
+    gone = [folder for folder in folders if not folder.is_dir()]
+    if gone or not folders:
+        problem = f"its logs are not at {gone[0]}" if gone else "it does not say where its logs are"
         raise DataError(f"{file}: {problem}; give their folder with --logs FOLDER")
     rig = read_rig(folders[0] / "rig.toml", specs)
     train = read_training(rig, folders, trust)
@@ -134,17 +129,35 @@ def logs_of(file: Path, stored: Stored, folders: Sequence[Path], trust: bool) ->
     return rig, train
 
 
-def origin(args: argparse.Namespace, bench: Bench, log: Log) -> Stored | None:
-    """The fit of --from; logs what differs between the rigs."""
+def prepared(args: argparse.Namespace, file: str, log: Log) -> tuple[Bench, Stored | None]:
+    """Data set of a run that writes `file`, and the fit of --from; logs what will be replaced and where rigs differ.
+
+    Raises StoreError where a file of somebody else would be replaced.
+    """
+    bench = read_bench(args.folder, args.trust_readings, args.more)
+    warn_of_logs(args.folder, bench)
+    check_own(args.out / name for name in (MODEL_FILE, "before.npz", AFTER_FILE, *REPORTS, "friction.png"))
+    check_own(args.out.glob("friction*.csv"), FRICTION)
+    if (args.out / file).exists():
+        log(f"the {'fit' if file == MODEL_FILE else 'diagnosis'} in {args.out} will be replaced")
     if args.start is None:
-        return None
-    file = model_file(args.start)
-    stored = read(file)
+        return bench, None
+    start = model_file(args.start)
+    stored = read(start)
     for line in differences(stored.fitted.rig, bench.rig):
         log(f"{line}; that of the fit is used")
     if stored.fingerprint and stored.fingerprint == fingerprint(bench.train.data):
-        raise DataError(f"{args.folder}: the logs of the fit in {file}; give others")
-    return stored
+        raise DataError(f"{args.folder}: the logs of the fit in {start}; give others")
+    return bench, stored
+
+
+def write_models(args: argparse.Namespace, fits: Mapping[str, Identified], data: Dataset, **notes: Any) -> None:
+    """Write fits to `data`; reports that are not of them are removed before."""
+    for name in REPORTS:
+        (args.out / name).unlink(missing_ok=True)
+    notes["logs"] = [str(folder.resolve()) for folder in (args.folder, *args.more)]  # found from any other folder
+    for name, fitted in fits.items():
+        save(args.out / name, fitted, fingerprint=fingerprint(data), notes=notes)
 
 
 def own_logs(args: argparse.Namespace, stored: Stored, log: Log) -> Dataset | None:
@@ -190,18 +203,6 @@ def write_states(folder: Path, logs: Logs, states: tuple[str, ...], mean, std) -
             values = np.where(np.isfinite(values), values, np.nan)
         columns = np.asarray(logs.data.t[i])[rows], *values.T
         write_csv(path, dict(zip(names, columns, strict=True)))
-
-
-def check_out(out: Path) -> None:
-    """Raise StoreError where a report would replace a file of somebody else."""
-    check_own(out / name for name in (MODEL_FILE, "before.npz", AFTER_FILE, *REPORTS, "friction.png"))
-    check_own(out.glob("friction*.csv"), FRICTION)
-
-
-def remove_reports(out: Path) -> None:
-    """Remove reports that are not of the models which are written now."""
-    for name in REPORTS:
-        (out / name).unlink(missing_ok=True)
 
 
 @contextmanager

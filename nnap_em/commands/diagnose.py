@@ -19,21 +19,10 @@ import jax
 
 from ..diagnosis.findings import findings
 from ..diagnosis.search import diagnose
-from ..fit.store import AFTER_FILE, fingerprint, save
+from ..fit.store import AFTER_FILE
 from ..report.diagnosis import write_diagnosis
 from ..storage.log import Log
-from .common import (
-    MISFIT_STATUS,
-    check_out,
-    go_on,
-    logs_at,
-    origin,
-    own_logs,
-    read_bench,
-    remove_reports,
-    resumable,
-    warn_of_logs,
-)
+from .common import MISFIT_STATUS, go_on, own_logs, prepared, resumable, write_models
 
 
 def run(args: argparse.Namespace, log: Log) -> int:
@@ -43,33 +32,25 @@ def run(args: argparse.Namespace, log: Log) -> int:
     # length and the page come after it: 17 of 105 s on a real double pendulum.
     search_share = 0.8
     seconds = search_share * 60.0 * args.minutes if args.minutes else math.inf
-    bench = read_bench(args.folder, args.trust_readings, args.more)
-    warn_of_logs(args.folder, bench)
-    check_out(args.out)
-    start = origin(args, bench, log)
+    bench, start = prepared(args, AFTER_FILE, log)
     own = start and own_logs(args, start, log)
-    if (args.out / AFTER_FILE).exists():
-        log(f"the diagnosis in {args.out} will be replaced")
     with resumable(args, bench, log) as journal:
 
         def report(text: str) -> None:
             left = f"[{_clock(60.0 * args.minutes - (time.perf_counter() - began))}] " if args.minutes else ""
             log(left + bench.rig.named(text))
 
-        spent = time.perf_counter() - began
-        key = jax.random.key(args.seed)
-        began_from = {"start": start and start.fitted, "own": own}
-        seconds -= spent
-        diagnosis = diagnose(bench.rig, bench.train.data, key=key, log=report, seconds=seconds, **began_from)
+        diagnosis = diagnose(
+            bench.rig, bench.train.data, key=jax.random.key(args.seed), log=report,
+            seconds=seconds - (time.perf_counter() - began), start=start and start.fitted, own=own,
+        )  # fmt: skip
         journal.open = not diagnosis.complete and not diagnosis.failure  # the same steps would fail again
-        accepted, mark = findings(diagnosis), fingerprint(bench.train.data)
-        remove_reports(args.out)
-        notes = {"settings": {"seed": args.seed}, "logs": logs_at(args)}
-        for name, fitted in (("before.npz", diagnosis.before), (AFTER_FILE, diagnosis.after)):
-            save(args.out / name, fitted, fingerprint=mark, notes=notes)
+        fits, settings = {"before.npz": diagnosis.before, AFTER_FILE: diagnosis.after}, {"seed": args.seed}
+        write_models(args, fits, bench.train.data, settings=settings)
         described = write_diagnosis(
-            args.out, diagnosis, accepted, bench.train, bench.test, seed=args.seed, began=began, log=report
-        )
+            args.out, diagnosis, findings(diagnosis), bench.train, bench.test,
+            seed=args.seed, began=began, log=report,
+        )  # fmt: skip
     if journal.open:
         log(go_on(journal))
     return 0 if described else MISFIT_STATUS

@@ -26,32 +26,25 @@ from ..data.rig import Rig
 from ..em.loop import EMState
 from ..fit.identify import MakeSmoother, Watch, identify
 from ..fit.known import identify_from
-from ..fit.store import MODEL_FILE, fingerprint, save
+from ..fit.store import MODEL_FILE
 from ..report.identification import write_identification
 from ..storage.log import Log
 from .cli import SMOOTHERS
-from .common import MISFIT_STATUS, check_out, logs_at, origin, read_bench, remove_reports, resumable, warn_of_logs
+from .common import MISFIT_STATUS, prepared, resumable, write_models
 
 
 def run(args: argparse.Namespace, log: Log) -> int:
     """Fit, and report; the test logs serve for the reported error alone."""
     began = time.perf_counter()
-    bench = read_bench(args.folder, args.trust_readings, args.more)
-    warn_of_logs(args.folder, bench)
-    check_out(args.out)
-    if (args.out / MODEL_FILE).exists():
-        log(f"the fit in {args.out} will be replaced")
+    bench, start = prepared(args, MODEL_FILE, log)
     data, epochs = bench.train.data, []
-    start = origin(args, bench, log)
     with resumable(args, bench, log):
         watch, key = _watch(bench.rig, args.epochs, epochs, log), jax.random.key(args.seed)
         options = {"key": key, "smoother": smoother(args), "epochs": args.epochs, "watch": watch}
         begin = identify if start is None else functools.partial(identify_from, start.fitted)
         fitted = begin(bench.rig, data, **options)
-        remove_reports(args.out)
         settings = {"smoother": args.smoother, "particles": args.particles, "seed": args.seed}
-        notes = {"settings": settings, "epochs": epochs, "logs": logs_at(args)}
-        save(args.out / MODEL_FILE, fitted, fingerprint=fingerprint(data), notes=notes)
+        write_models(args, {MODEL_FILE: fitted}, data, settings=settings, epochs=epochs)
         described = write_identification(
             args.out, fitted, bench.train, bench.test, epochs,
             smoother=args.smoother, seed=args.seed, began=began, log=log,
@@ -74,16 +67,15 @@ def _watch(rig: Rig, most: int, epochs: list[dict[str, Any]], log: Log) -> Watch
         nonlocal last
         moment, out = time.perf_counter(), np.flatnonzero(~np.asarray(used)).tolist()
         horizon, loglik, seconds = seen * rig.dt, float(state.loglik[-1]), moment - last
+        last = moment
         epochs.append(
             {"epoch": state.epoch, "horizon_s": horizon, "log_likelihood": loglik, "left_out": out, "seconds": seconds}
         )
-        last = moment
-        noise = _noise(rig, np.asarray(state.best.log_r))
         sampled = f"  effective samples {state.ess:.0f}" if math.isfinite(state.ess) else ""
         log(
-            f"epoch {state.epoch:3d} of {most}  horizon {horizon:.2f} s"
-            f"  log-likelihood {loglik:.2f} nat per sequence"
-            f"  noise std {noise}{sampled}  left out {len(out)} of {len(used)}  {seconds:.1f} s"
+            f"epoch {state.epoch:3d} of {most}  horizon {horizon:.2f} s  log-likelihood {loglik:.2f} nat per sequence"
+            f"  noise std {_noise(rig, np.asarray(state.best.log_r))}{sampled}"
+            f"  left out {len(out)} of {len(used)}  {seconds:.1f} s"
         )
 
     return watch

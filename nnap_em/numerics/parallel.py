@@ -21,8 +21,8 @@ from jax.core import Tracer
 from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
-from jaxtyping import Int
 
+from .digest import is_key
 from .traced import traced
 
 AXIS = "seq"
@@ -96,7 +96,7 @@ def each(function: Callable, common: Any, batch: Any, *, together: int | None = 
     common = on_default_device(common) if mesh is None else _place(common, NamedSharding(mesh, P()))
     for first in range(0, count, at_once):
         index = np.minimum(np.arange(first, first + at_once), count - 1)  # padding repeats the last entry
-        some = jax.tree.map(lambda a: a if len(a) == at_once else _taken(a, index), batch)  # noqa: B023
+        some = jax.tree.map(lambda a: a if len(a) == at_once else _by_numbers(lambda n: n[index], a), batch)  # noqa: B023
         if mesh is None:
             parts.append(program(None, common, on_default_device(some)))
         else:
@@ -143,18 +143,11 @@ def on_default_device(tree: Any) -> Any:
     return eqx.combine(jax.device_put(arrays, home), others)
 
 
-def _is_key(a: Any) -> bool:
-    """True for random keys, which NumPy does not know."""
-    return jnp.issubdtype(a.dtype, jax.dtypes.prng_key)
-
-
-def _taken(a: Any, index: Int[np.ndarray, " entry"]) -> Any:
-    """Entries of an array or of random keys, by NumPy: JAX cuts by a program for every shape."""
-    if not _is_key(a):
-        return np.asarray(a)[index]
-    return jax.random.wrap_key_data(
-        jax.device_put(np.asarray(jax.random.key_data(a))[index]), impl=jax.random.key_impl(a)
-    )
+def _by_numbers(change: Callable, a: Any) -> Any:
+    """`change` of an array, or of the numbers of random keys."""
+    if not is_key(a):
+        return change(np.asarray(a))
+    return jax.random.wrap_key_data(change(np.asarray(jax.random.key_data(a))), impl=jax.random.key_impl(a))
 
 
 def _bound_to(a: Any, device: Any) -> bool:
@@ -165,20 +158,12 @@ def _bound_to(a: Any, device: Any) -> bool:
 def _place(tree, sharding: NamedSharding):
     """Arrays that this process holds whole, where its devices' shares of them belong."""
     arrays, others = eqx.partition(tree, lambda a: isinstance(a, jax.Array | np.ndarray))
-    leaves, structure = jax.tree.flatten(arrays)
-    kinds = [jax.random.key_impl(a) if _is_key(a) else None for a in leaves]
-    plain = [a if kind is None else jax.random.key_data(a) for a, kind in zip(leaves, kinds, strict=True)]
     if jax.process_count() == 1:
         if jax.default_backend() == "cpu":  # NumPy cuts by views, JAX by a program for every shape
-            plain = [np.asarray(a) for a in plain]
-        placed = jax.device_put(plain, sharding)  # all in one call: each takes its time
-    else:
-        local = [np.asarray(a) for a in plain]
-        placed = [jax.make_array_from_callback(a.shape, sharding, a.__getitem__) for a in local]
-    keyed = [
-        a if kind is None else jax.random.wrap_key_data(a, impl=kind) for a, kind in zip(placed, kinds, strict=True)
-    ]
-    return eqx.combine(jax.tree.unflatten(structure, keyed), others)
+            arrays = jax.tree.map(lambda a: a if is_key(a) else np.asarray(a), arrays)
+        return eqx.combine(jax.device_put(arrays, sharding), others)  # all in one call: each takes its time
+    spread = lambda a: jax.make_array_from_callback(a.shape, sharding, a.__getitem__)  # noqa: E731
+    return eqx.combine(jax.tree.map(lambda a: _by_numbers(spread, a), arrays), others)
 
 
 def _gather(tree):

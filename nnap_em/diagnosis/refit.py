@@ -19,8 +19,7 @@ from ..em.multistep import Followed
 from ..model.state_space import StateSpaceModel
 from ..numerics.gaussian import Gaussian
 from ..numerics.parallel import each
-from ..smoother.gaussian import linear_posterior
-from ..smoother.kalman import CUBATURE, kalman_filter, rts
+from ..smoother.kalman import CUBATURE, kalman_filter, linear_posterior, rts
 from ..smoother.posterior import Posterior
 from ..storage.journal import HERE, step
 

@@ -23,7 +23,8 @@ from ..numerics.gaussian import Gaussian
 from ..numerics.parallel import each
 from ..numerics.profile import stage
 from ..numerics.random import keys_of
-from ..smoother.posterior import AbstractBranching, AbstractSmoother, Posterior, likeliest
+from ..smoother.mixture import MixtureSmoother
+from ..smoother.posterior import AbstractSmoother, Posterior, likeliest
 from ..storage.journal import HERE, step
 from .mstep import AbstractMStep, MStepInfo, between, not_diverged
 from .readings import onset
@@ -110,7 +111,7 @@ def _alone(model: AbstractModel, data: Dataset, smoother: AbstractSmoother, *, k
 def _with_mixture(
     model: AbstractModel,
     data: Dataset,
-    second: AbstractBranching | None,
+    second: MixtureSmoother | None,
     first: Posterior,
     kept: Gaussian | None = None,
 ) -> Posterior:
@@ -123,7 +124,7 @@ def _with_mixture(
     return _replaced(first, path, loglik, some)
 
 
-def beyond(first: Posterior, second: AbstractBranching | None) -> Int[np.ndarray, " some"]:
+def beyond(first: Posterior, second: MixtureSmoother | None) -> Int[np.ndarray, " some"]:
     """Sequences that are wider than the first smoother can follow, so that the second one is used.
 
     None where that is part of a larger program, which has no numbers to decide by.

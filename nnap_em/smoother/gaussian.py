@@ -10,8 +10,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from ..model.base import AbstractModel, Prepared
 from ..numerics.gaussian import Gaussian
-from .kalman import Cubature, Filtered, Smoothed, Tangent, ekf, relinearised, rts
-from .linear import linear_posterior
+from .kalman import Cubature, Filtered, Smoothed, Tangent, ekf, linear_posterior, relinearised, rts
 from .mixture import MixtureSmoother
 from .posterior import AbstractSmoother, Posterior, likeliest
 from .start import StartBank

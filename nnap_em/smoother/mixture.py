@@ -10,7 +10,7 @@ Syst. 43(3), for merging]
 
 import math
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -20,9 +20,19 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from ..model.base import AbstractModel, Prepared
 from ..numerics.gaussian import Gaussian, cholesky, lower
-from .kalman import Cubature, Filtered, Smoothed, Tangent, absorbed, linear_reading, moved, relinearised, rts
-from .linear import linear_posterior
-from .posterior import AbstractBranching, Posterior, likeliest
+from .kalman import (
+    Cubature,
+    Filtered,
+    Smoothed,
+    Tangent,
+    absorbed,
+    linear_posterior,
+    linear_reading,
+    moved,
+    relinearised,
+    rts,
+)
+from .posterior import AbstractSmoother, Posterior, likeliest
 
 WIDE_STD = 0.2
 """Standard deviation of an unread angle beyond which one Gaussian does not describe it [rad].
@@ -172,11 +182,13 @@ def branch(tree: Tree, last: Int[Array, ""]) -> Filtered:
     return rows._replace(loglik=rows.loglik[-1])
 
 
-class MixtureSmoother(AbstractBranching):
+class MixtureSmoother(AbstractSmoother):
     """Gaussian-sum filter, smoothed along the ancestors of every final component: the likeliest path."""
 
-    places: tuple[int, ...] = eqx.field(static=True)
-    """Places of the angles in the state."""
+    wide: ClassVar[float] = WIDE_STD
+    """Largest `Posterior.width` that is left to one Gaussian [rad]."""
+    angles: tuple[int, ...] = eqx.field(static=True)
+    """Places of the angles in which paths differ."""
     linearise: Tangent | Cubature
     iterations: int = eqx.field(static=True, default=4)
     """Relinearisations about a smoothed path; one more, about the last path, gives its likelihood.
@@ -192,20 +204,14 @@ class MixtureSmoother(AbstractBranching):
         """Memory [B] that a row takes."""
         return 8192 * self.components
 
-    @property
-    def wide(self) -> float:
-        """Standard deviation of an angle beyond which one Gaussian is not enough [rad]."""
-        return WIDE_STD
-
-    @property
-    def angles(self) -> tuple[int, ...]:
-        """Places of the angles in which paths differ."""
-        return self.places
-
     def paths(
         self, model: AbstractModel, seq: Prepared, first: Gaussian | None = None, kept: Gaussian | None = None
     ) -> tuple[Posterior, Float[Array, " path"]]:
-        """Posterior along the ancestors of every final component, or about `kept`, and about `first`."""
+        """The posterior along the ancestors of every final component, or about `kept` alone, and about `first`.
+
+        The likelihood is that of the model linearised about the path itself, and -inf where there is none. With it
+        the likelihoods about the paths that these began from.
+        """
         if kept is None:
             start = jax.tree.map(lambda a: jnp.broadcast_to(a, (self.components, *a.shape)), model.start)
             log_weight = jnp.where(jnp.arange(self.components) == 0, 0.0, -jnp.inf)

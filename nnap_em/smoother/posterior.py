@@ -2,7 +2,7 @@
 
 from abc import abstractmethod
 from collections.abc import Sequence
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -57,36 +57,13 @@ class AbstractSmoother(eqx.Module):
         """
         return self
 
-    def second(self) -> "AbstractBranching | None":
-        """The smoother of sequences whose `width` is beyond its `wide`; None where there is none."""
+    def second(self) -> Any:
+        """The `MixtureSmoother` of sequences whose `width` is beyond its `wide`; None where there is none."""
         return None
 
     def tries(self) -> Sequence["AbstractSmoother"]:
         """Smoothers of one structure, one program for all, of which each sequence keeps the likeliest outcome."""
         return (self,)
-
-
-class AbstractBranching(AbstractSmoother):
-    """A smoother that follows several paths of one sequence; it serves where another finds the posterior too wide."""
-
-    @property
-    @abstractmethod
-    def wide(self) -> float:
-        """Largest `Posterior.width` that is left to the other one [rad]."""
-
-    @property
-    @abstractmethod
-    def angles(self) -> tuple[int, ...]:
-        """Places of the angles in which paths differ."""
-
-    @abstractmethod
-    def paths(
-        self, model: AbstractModel, seq: Prepared, first: Gaussian | None = None, kept: Gaussian | None = None
-    ) -> tuple[Posterior, Float[Array, " path"]]:
-        """The posterior about each of several paths, or about the path `kept` alone, and about the path `first`, with a
-        leading axis; the likelihood is that of the model linearised about the path itself, and -inf where there is
-        none. With it the likelihoods about the paths that these began from.
-        """
 
 
 def likeliest(score: Float[Array, " candidate"]) -> Int[Array, ""]:

@@ -11,7 +11,6 @@ from rigs import slide_logs
 from nnap_em.diagnosis.context import SEARCH_EFFORT, SearchContext, extend
 from nnap_em.diagnosis.hypothesis import Hypothesis
 from nnap_em.diagnosis.losses import MultiStep
-from nnap_em.em.loop import Schedule
 from nnap_em.fit.identify import friction_table, identify
 
 
@@ -55,10 +54,3 @@ def test_friction_that_is_right_is_gone_on_from(slide_fit):
     state, lines = _extended(slide_fit, slide_logs(0), slide_fit.model)
     assert len(lines) == 1
     assert np.nanmean(state.top) == pytest.approx(np.nanmean(slide_fit.state.top), abs=0.5)
-
-
-@pytest.mark.parametrize("hold", [1, 2, 3])
-def test_the_first_horizon_lasts_as_many_epochs_as_are_compared(hold):
-    schedule = Schedule(first=60, growth=1.6, hold=hold)
-    rows = [schedule.horizon(epoch, 1000) for epoch in range(schedule.at_first + 1)]
-    assert rows == [60] * schedule.at_first + [96]

@@ -15,7 +15,6 @@ from nnap_em.fit.identify import Identified, begin, friction_table, phi_samples
 from nnap_em.fit.predict import Prediction, given_samples, horizon_errors, posterior_of, predict, smooth
 from nnap_em.model.simulate import simulate
 from nnap_em.model.state_space import Inputs, StateSpaceModel
-from nnap_em.numerics import parallel
 from nnap_em.numerics.gaussian import Gaussian
 from nnap_em.smoother.gaussian import CubatureSmoother
 from nnap_em.smoother.particle import ParticleSmoother
@@ -24,6 +23,7 @@ from nnap_em.systems.pendulum import Pendulum
 
 DT, ROWS, SAMPLES = 0.02, 80, 400
 GIVEN = 0.5
+KEY = jax.random.key(1)
 PHYSICS = {"m": 0.5, "lc": 0.2, "I": 0.002, "g": 9.81}
 
 
@@ -75,7 +75,7 @@ def test_given_rows_are_those_up_to_the_time():
 
 def test_without_noise_the_prediction_is_the_integral():
     case = _case(q=1e-7, information=1e20)
-    prediction = predict(case.fitted, case.data, GIVEN, key=jax.random.key(1), samples=SAMPLES)
+    prediction = predict(case.fitted, case.data, GIVEN, key=KEY, samples=SAMPLES)
     model = case.fitted.model
     last = int(np.sum(given_samples(case.data, GIVEN)[0])) - 1
     ahead = np.asarray(prediction.ahead)
@@ -95,34 +95,21 @@ def test_without_noise_the_prediction_is_the_integral():
 
 def test_groups_of_sequences_and_rows_of_padding_change_nothing(monkeypatch):
     """Each is smoothed and predicted alone where memory has room for one; padded rows change no number."""
-    case, groups = _case(q=1e-2, information=1.0), []
-    program, rows = parallel._program, case.data.t.shape[1]
-
-    def counted(function):
-        return lambda mesh, *rest: groups.append(len(jax.tree.leaves(rest[-1])[0])) or program(function)(mesh, *rest)
-
-    monkeypatch.setattr(parallel, "_program", counted)
-
-    def prediction(data):
-        groups.clear()
-        return predict(case.fitted, data, GIVEN, key=jax.random.key(1), samples=SAMPLES)
-
-    together = prediction(case.data)
-    assert groups == 5 * [4]  # three tries to smooth, the likeliest, the prediction: of three and one for its shape
+    case = _case(q=1e-2, information=1.0)
+    together = predict(case.fitted, case.data, GIVEN, key=KEY, samples=SAMPLES)
     monkeypatch.setattr(AbstractSmoother, "room", 1)
-    single = prediction(stepped(case.data, 99))
-    assert groups == 9 * [1] + [4] + 3 * [1]
-    assert single.mean.shape[1] == 104 and together.mean.shape[1] == rows
+    single = predict(case.fitted, stepped(case.data, 99), GIVEN, key=KEY, samples=SAMPLES)
+    assert single.mean.shape[1] == 104
     for a, b in zip(together, single, strict=True):
         # rounding, in other programs, over 80 rows of a smooth motion
-        np.testing.assert_allclose(a, np.asarray(b)[:, :rows], rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(a, np.asarray(b)[:, :ROWS], rtol=1e-9, atol=1e-12)
 
 
 def test_std_grows_as_the_kicks_add_up():
     """Near rest the pendulum is linear: the covariance obeys P' = F P F' + Q, here against draws."""
     case = _case(q=1e-2, information=1e20)
     quiet = case.data._replace(y=0.001 * case.data.y, u=0.0 * case.data.u)
-    prediction = predict(case.fitted, quiet, GIVEN, key=jax.random.key(1), samples=SAMPLES)
+    prediction = predict(case.fitted, quiet, GIVEN, key=KEY, samples=SAMPLES)
     model = case.fitted.model
     last = int(np.sum(given_samples(quiet, GIVEN)[0])) - 1
     f = np.asarray(jax.jit(jax.jacfwd(model.transition))(jnp.zeros(2), Inputs.held(jnp.zeros(1))))
@@ -151,15 +138,13 @@ def test_the_smoother_of_the_fit_is_the_one_that_smooths():
     std = np.sqrt(np.diagonal(np.asarray(kalman.state.cov), axis1=2, axis2=3))
     # means of 400 paths through 300 particles: a standard error of 0.08, 480 of them
     assert np.max(np.abs(np.asarray(posterior.state.mean - kalman.state.mean)) / std) < 5 * 0.08
-    one, again = (predict(drawn, case.data, GIVEN, key=jax.random.key(1), samples=SAMPLES) for _ in range(2))
-    np.testing.assert_array_equal(one.mean, again.mean)
+    np.testing.assert_array_equal(posterior_of(drawn, case.data).state.mean, posterior.state.mean)
 
 
 def test_uncertain_friction_widens_the_prediction():
-    sure, unsure = (_case(q=1e-5, information=i) for i in (1e20, 1e2))
-    key = jax.random.key(1)
-    std = [predict(c.fitted, c.data, GIVEN, key=key, samples=SAMPLES).std[:, -1, 0] for c in (sure, unsure)]
-    assert np.all(np.asarray(std[1]) > 1.5 * np.asarray(std[0]))
+    cases = (_case(q=1e-5, information=information) for information in (1e20, 1e2))
+    sure, unsure = (predict(c.fitted, c.data, GIVEN, key=KEY, samples=SAMPLES).std[:, -1, 0] for c in cases)
+    assert np.all(np.asarray(unsure) > 1.5 * np.asarray(sure))
 
 
 def test_uncertain_friction_widens_what_is_smoothed_where_nothing_is_read():

@@ -20,7 +20,6 @@ from nnap_em.diagnosis.statistics import FAILS, dependence, holm, spread, whiten
 from nnap_em.effects.position import TorsionalSpring
 from nnap_em.fit.identify import begin
 from nnap_em.model.state_space import with_effects
-from nnap_em.smoother.particle import ParticleSmoother
 
 DT = 0.01
 NAMES = Names(("theta1", "x"), ("dtheta1", "dx"), (True, False), ("u",), (1,), ("theta1", "dx"))
@@ -32,12 +31,6 @@ def _noise(seed, shape=(10, 300)):
 
 def _residual(seed, **changes):
     return right_residual(1000 + seed, (10, 300), 2, 2, **changes)
-
-
-def test_every_column_has_the_unit_of_its_joint():
-    """Joints count from 1, as those of a system."""
-    assert [NAMES.force_unit(1), NAMES.force_unit(2), NAMES.unit("u")] == ["N m", "N", "N m"]
-    assert [NAMES.unit(name) for name in ("theta1", "dtheta1", "dx", "time")] == ["rad", "rad/s", "m/s", "s"]
 
 
 def test_holm_by_hand():
@@ -141,15 +134,15 @@ def test_lost_sequences_take_no_part():
     assert run_tests(whole._replace(used=np.zeros(10, bool)), NAMES) == []
 
 
-def _slide(force, noise=(1e-3, 1e-4), mass=2.0):
-    """A slide with both states measured under a force that depends on time, position and velocity; a fit of it."""
+@pytest.fixture(scope="module")
+def forced():
+    """A fit of a slide with both states read, whose process noise is as large as the force that it does not know."""
+    mass, noise, rows = 2.0, (1e-3, 1e-4), round(3.0 / DT) + 1
     read = {"x": noise[0], "dx": noise[1]}
     rig = Rig("slide", "slide", {"m": Declared(mass, 0.0)}, False, ("u",), (1,), DT, "sequence", tuple(read), read, {})
-    rng = np.random.default_rng(0)
-    rows = round(3.0 / DT) + 1
+    rng, t = np.random.default_rng(0), DT * np.arange(rows)
     logs, truth = [], []
     for _ in range(6):
-        t = DT * np.arange(rows)
         u = np.sin(rng.uniform(1, 4) * t + rng.uniform(0, 6))
         x, v = rng.normal(), rng.normal()
         path, forces = [], []
@@ -157,29 +150,18 @@ def _slide(force, noise=(1e-3, 1e-4), mass=2.0):
             path.append((x, v))
             total = 0.0
             for _ in range(50):  # of semi-implicit Euler
-                f = force(t[k], x, v)
+                f = 1.5 * math.sin(2 * t[k]) - 0.8 * x
                 total += f / 50
                 v += (u[k] + f) / mass * DT / 50
                 x += v * DT / 50
             forces.append(total)
-        readings = np.asarray(path) + np.asarray(noise) * rng.normal(size=(rows, 2))
-        logs.append((t, u[:, None], readings))
+        logs.append((t, u[:, None], np.asarray(path) + np.asarray(noise) * rng.normal(size=(rows, 2))))
         truth.append(forces)
-    data = pad(logs)
-    return begin(rig, data, key=jax.random.key(0)), data, np.asarray(truth)
-
-
-def _with_kick(fitted, std):
-    """Process noise of the velocity as given; of the position what a force does to it within a sample."""
-    log_q = jnp.log(jnp.asarray([3e-5, std])) * 2
-    return fitted._replace(state=eqx.tree_at(lambda s: s.best.log_q, fitted.state, log_q))
-
-
-@pytest.fixture(scope="module")
-def forced():
-    """A fit whose process noise is as large as the force that it does not know."""
-    fitted, data, truth = _slide(lambda t, x, v: 1.5 * math.sin(2 * t) - 0.8 * x)
-    return _with_kick(fitted, float(np.std(truth)) * DT / 2.0), data, truth
+    data, truth = pad(logs), np.asarray(truth)
+    fitted = begin(rig, data, key=jax.random.key(0))
+    # of the rate as said; of the position what a force does to it within a sample
+    log_q = 2 * jnp.log(jnp.asarray([3e-5, np.std(truth) * DT / mass]))
+    return fitted._replace(state=eqx.tree_at(lambda s: s.best.log_q, fitted.state, log_q)), data, truth
 
 
 def test_a_known_force_comes_back_within_its_standard_deviation(forced):
@@ -195,29 +177,18 @@ def test_a_known_force_comes_back_within_its_standard_deviation(forced):
     np.testing.assert_allclose(left.u, data.u)
 
 
-@pytest.mark.slow  # fast: test_the_smoother_of_the_fit_is_the_one_that_smooths
-def test_a_force_comes_back_by_particles_too(forced):
-    """Whatever smooths gives all that a residual needs."""
-    fitted, data, _ = forced
-    kalman = residual(fitted, data)
-    particles = residual(fitted._replace(smoother=ParticleSmoother(fitted.smoother)), data)
-    assert particles.used.all()
-    error = (particles.force[:, :-1, 0] - kalman.force[:, :-1, 0]) / kalman.force_std[:, :-1, 0]
-    assert np.sqrt(np.mean(error**2)) < 0.3  # of draws: 100 paths through 300 particles
-    np.testing.assert_allclose(particles.innovation, kalman.innovation, atol=1e-6)  # a slide is linear: no path matters
-
-
-def test_adding_an_effect_back_gives_its_force():
-    spring = TorsionalSpring(*map(jnp.asarray, (0.8, 0.24, 0.0, 0.0)), joint=1)
-    fitted, data, truth = _slide(lambda t, x, v: 0.24 - 0.8 * x)
-    fitted = _with_kick(fitted, 1e-3)
-    model = with_effects(fitted.model, (spring,))
-    fitted = fitted._replace(state=fitted.state._replace(best=model))
-    left = residual(fitted, data)
-    assert np.sqrt(np.nanmean(left.force**2)) < 0.05 * np.std(truth)
+def test_adding_an_effect_back_gives_its_force(forced):
+    """A spring in the model takes its force out of the residual; what is left is the force of time."""
+    fitted, data, truth = forced
+    spring = TorsionalSpring(*map(jnp.asarray, (0.8, 0.0, 0.0, 0.0)), joint=1)
+    state = fitted.state._replace(best=with_effects(fitted.model, (spring,)))
+    left = residual(fitted._replace(state=state), data)
     whole = left.without_effects()
-    np.testing.assert_allclose(np.nanmean(whole.force[:, :-1, 0] - truth[:, :-1], axis=1), 0, atol=0.01)
-    np.testing.assert_allclose(whole.force[:, :-1, 0], truth[:, :-1], atol=0.2 * np.std(truth))
+    of_spring = -0.8 * (left.state[:, :-1, 0] + left.state[:, 1:, 0]) / 2
+    np.testing.assert_allclose((whole.force - left.force)[:, :-1, 0], of_spring, atol=0.01 * np.abs(of_spring).max())
+    for force, expected in ((whole.force, truth), (left.force, truth[:, :-1] - of_spring)):
+        error = (force[:, :-1, 0] - expected[:, : of_spring.shape[1]]) / whole.force_std[:, :-1, 0]
+        assert np.sqrt(np.mean(error**2)) < 1.1
 
 
 def test_there_is_an_innovation_where_there_is_a_reading(forced):
@@ -228,14 +199,14 @@ def test_there_is_an_innovation_where_there_is_a_reading(forced):
     np.testing.assert_array_equal(np.isfinite(left.innovation), np.isfinite(y))
 
 
-def test_joints_are_called_by_number_and_by_the_name_of_their_own():
+def test_names_carry_units_and_the_name_of_a_joint_of_its_own(forced):
+    """Joints count from 1, as those of a system."""
+    assert [NAMES.force_unit(1), NAMES.force_unit(2), NAMES.unit("u")] == ["N m", "N", "N m"]
+    assert [NAMES.unit(name) for name in ("theta1", "dtheta1", "dx", "time")] == ["rad", "rad/s", "m/s", "s"]
+    slide = names_of(forced[0])
+    assert [slide.unit(n) for n in ("x", "dx", "u", "time")] == ["m", "m/s", "N", "s"]
     names = NAMES._replace(coordinates=("theta1", "elbow", "x3"), rates=("dtheta1", "delbow", "dx3"))
     assert [names.joint(j) for j in (1, 2, 3)] == ["joint 1", "joint 2 (elbow)", "joint 3"]
     text = "motor gain at joint 2: joints 1 and 2, joint 1, joint 22, joint 2 (elbow)"
     expected = "motor gain at joint 2 (elbow): joints 1 and 2, joint 1, joint 22, joint 2 (elbow)"
     assert with_names(text, names.coordinates) == expected
-
-
-def test_names_carry_units(forced):
-    names = names_of(forced[0])
-    assert [names.unit(n) for n in ("x", "dx", "u", "time")] == ["m", "m/s", "N", "s"]

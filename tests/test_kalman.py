@@ -20,7 +20,7 @@ from nnap_em.model.base import AbstractModel, Prepared, prepare
 from nnap_em.model.simulate import examples, sweep_experiment
 from nnap_em.numerics.gaussian import Gaussian
 from nnap_em.smoother.gaussian import CubatureSmoother, GaussianSmoother
-from nnap_em.smoother.kalman import Affine, Cubature, Reading, Tangent, ekf, kalman_filter, rts
+from nnap_em.smoother.kalman import Affine, Cubature, Reading, Tangent, kalman_filter, rts
 from nnap_em.smoother.start import StartBank
 
 LOG_2PI = np.log(2 * np.pi)
@@ -156,8 +156,6 @@ def test_every_pattern_of_missing_readings():
 
 ROUTES = {
     "tangent": GaussianSmoother(StartBank((1, 1, 1)), Tangent(), iterations=0),
-    "cubature": GaussianSmoother(StartBank((1, 1, 1)), Cubature(), iterations=0),
-    "tangent, again": GaussianSmoother(StartBank((1, 1, 1)), Tangent(), iterations=2),
     "cubature, again": GaussianSmoother(StartBank((1, 1, 1)), Cubature(), iterations=2, inflations=(1.0, 9.0)),
 }
 
@@ -315,17 +313,6 @@ def test_covariances_stay_symmetric_and_positive():
         assert size[0, 0] > -1e6 * np.finfo(float).eps
 
 
-@pytest.mark.parametrize("linearise", [Tangent(), Cubature()], ids=["tangent", "cubature"])
-def test_extended_filter_is_kalmans_on_a_linear_system(linearise):
-    """Also in what no smoother hands on; what is not measured may hold any number."""
-    p = _problem(1, time=4)
-    observed = jnp.asarray(np.random.default_rng(0).uniform(size=p.y.shape) < 0.5)
-    other = Prepared(p.u, jnp.where(observed, p.y, 1e6), observed, _active(4))
-    extended = jax.jit(lambda seq: ekf(p.model, p.start, seq, linearise))(other)
-    for a, b in zip(jax.tree.leaves(extended), jax.tree.leaves(_run(p, observed, _active(4))[0]), strict=True):
-        np.testing.assert_allclose(a, b, rtol=1e-11, atol=1e-11)  # matrix, offset and noise are rounded, nothing else
-
-
 class _Bent(NamedTuple):
     f: Callable
 
@@ -357,14 +344,6 @@ def test_cubature_has_the_slope_and_mean_of_a_polynomial():
     assert np.all(np.linalg.eigvalsh(affine.noise) > -1e-15)
 
 
-def test_cubature_is_the_tangent_where_the_state_is_sure():
-    about = Gaussian(jnp.asarray([0.3, -0.8]), 1e-8 * jnp.eye(2))
-    f = lambda x: jnp.stack([jnp.sin(x[0] * x[1]), jnp.exp(x[1])])  # noqa: E731
-    wide, narrow = (_bent(rule, f, about) for rule in (Cubature(), Tangent()))
-    for a, b in zip(wide, narrow, strict=True):
-        np.testing.assert_allclose(a, b, atol=1e-6)  # differences go with the variance, 1e-8, times curvature
-
-
 def test_padding_changes_no_digit():
     """Four rows of sixty, in the programs of other tests."""
     p = _problem(7, time=4)
@@ -379,25 +358,6 @@ def test_padding_changes_no_digit():
     # the smoother passes the padding by solving with the state's own covariance: rounding, and no more
     np.testing.assert_allclose(short[1].state.mean, long[1].state.mean[:4], rtol=1e-12, atol=1e-12)
     np.testing.assert_allclose(short[1].state.cov, long[1].state.cov[:4], rtol=1e-12, atol=1e-12)
-
-
-def test_innovations_are_white_with_unit_variance():
-    """Readings drawn from the model itself, 34 times 60 rows."""
-    p, rng, e = _problem(11, time=60), np.random.default_rng(5), []
-    for _ in range(34):
-        x, y = rng.multivariate_normal(p.start.mean, p.start.cov), []
-        for k in range(60):
-            y.append(np.asarray(p.model.c) @ x + rng.normal(size=2) * np.exp(0.5 * np.asarray(p.model.log_r)))
-            x = np.asarray(p.affine.matrix[k]) @ x + np.asarray(p.affine.offset[k])
-            x = x + rng.normal(size=3) * np.exp(0.5 * np.asarray(p.model.log_q))
-        e.append(_run(p._replace(y=jnp.asarray(y)), jnp.ones((60, 2), bool), _active(60))[0].innovation)
-    e = np.stack(e)
-    count = e[..., 0].size
-    bound = 4 / np.sqrt(count)  # four standard errors
-    assert np.all(np.abs(e.mean((0, 1))) < bound)
-    assert np.all(np.abs((e**2).mean((0, 1)) - 1) < np.sqrt(2) * bound)
-    assert np.all(np.abs(np.einsum("ski,skj->ij", e[:, 1:], e[:, :-1]) / count) < bound)
-    assert abs(np.mean(e[..., 0] * e[..., 1])) < bound
 
 
 def test_nile_has_the_published_likelihood():

@@ -620,12 +620,12 @@ bodies that cannot be
 a step out of the physical ones
 - jnp.where(fine, after[name], one)
 + jnp.where(fine, after[name], after[name])
-## test_machines.py::test_a_payload_of_any_mass_and_centre_moves_the_machine_as_in_mujoco[arm3]
+## test_machines.py::test_a_payload_of_any_mass_and_centre_moves_the_machine_as_in_mujoco
 a load in the middle
 - add(scaled(mass, spot.point), moment)
 + moment
 # systems/sensing.py
-## test_sensors.py::test_readings_are_those_of_mujoco_under_torque_and_friction[branch]
+## test_sensors.py::test_readings_are_those_of_mujoco_under_torque_and_friction
 an accelerometer without what turning adds
 - add(cross(turns, place), cross(spin, cross(spin, place)))
 + cross(turns, place)

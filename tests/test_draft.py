@@ -1,16 +1,22 @@
-"""The first rig.toml: what a log tells is right, what it does not is asked for by name, and nothing is overwritten."""
+"""The first rig.toml: what a log tells is right, the rest is asked for by name, import takes it, nothing is lost."""
 
+import functools
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
 from helpers import data_sets
+from recorders import Q, T, V, ns, plain_json, robot_log, write_hdf5, write_mcap
 
 from nnap_em.commands import cli
 from nnap_em.data.dataset import DataError
 from nnap_em.data.formats import write_csv
+from nnap_em.data.logs import read_logs
 from nnap_em.data.rig import RigError, SystemSpec, read_rig
-from nnap_em.init.from_log import draft
+from nnap_em.import_.recording import Topic
+from nnap_em.init.draft import draft, found_columns
+from nnap_em.init.from_machine import draft_machine
 from nnap_em.systems import specs
 
 DT, ROWS = 0.02, 400
@@ -19,17 +25,15 @@ NOISE = {"theta1": 2e-3, "theta2": 1e-3, "dtheta1": 0.02, "dtheta2": 0.05, "x": 
 
 def _log(*names: str, t0: float = 0.0) -> dict[str, np.ndarray]:
     """Smooth signals, with white noise on those that are states."""
-    t = DT * np.arange(ROWS)
-    rng = np.random.default_rng(0)
-    columns = {"time": t0 + t}
-    for i, name in enumerate(names):
-        columns[name] = np.sin((1 + 0.3 * i) * t + i) + rng.normal(size=ROWS) * NOISE.get(name, 0.0)
-    return columns
+    t, rng = DT * np.arange(ROWS), np.random.default_rng(0)
+    swing = {name: np.sin((1 + 0.3 * i) * t + i) + rng.normal(size=ROWS) * NOISE.get(name, 0.0)
+             for i, name in enumerate(names)}  # fmt: skip
+    return {"time": t0 + t} | swing
 
 
-def _draft(tmp_path, *names: str, system: str | None = None, t0: float = 0.0):
+def _draft(tmp_path, *names: str, system: str | None = None):
     path = tmp_path / "bench" / "01.csv"
-    write_csv(path, _log(*names, t0=t0))
+    write_csv(path, _log(*names))
     return draft(path, system, specs)
 
 
@@ -48,149 +52,81 @@ SYSTEMS = {  # columns, system given, the system, inputs and joints that must be
 
 
 @pytest.mark.parametrize("names, given, system, inputs", SYSTEMS.values(), ids=SYSTEMS)
-def test_what_a_log_tells_is_right(tmp_path, names, given, system, inputs):
+def test_what_a_log_tells_is_right_and_what_is_left_is_refused_by_name(tmp_path, names, given, system, inputs):
     drafted = _draft(tmp_path, *names, system=given)
-    assert not drafted.notes
-    assert drafted.missing == {"model": [name for name in specs[system].parameters if name != "g"]}
+    numbers = [name for name in specs[system].parameters if name != "g"]
+    assert drafted.missing == {"model": numbers} and not drafted.mapped
+    (tmp_path / "rig.toml").write_text(_filled(drafted.text.replace(f"# {numbers[-1]} =", "#")))
+    with pytest.raises(RigError, match=rf"rig.toml: \[model\] {numbers[-1]}: missing .*write {numbers[-1]} = 0.2"):
+        read_rig(tmp_path / "rig.toml", specs)
     (tmp_path / "rig.toml").write_text(_filled(drafted.text))
     rig = read_rig(tmp_path / "rig.toml", specs)
     assert (rig.system, rig.name, rig.dt, rig.clock, rig.friction) == (system, "bench", DT, "sequence", True)
     assert dict(zip(rig.input_columns, rig.input_joints, strict=True)) == inputs
-    assert rig.measured == tuple(name for name in names if name in specs[system].states)
+    assert set(rig.noise_std) == set(rig.measured) == {name for name in names if name in specs[system].states}
     for name, std in rig.noise_std.items():
         # the median of 397 third differences, correlated over three: about 8 %
         assert std == pytest.approx(NOISE[name], rel=0.25)
-    assert set(rig.noise_std) == set(rig.measured)
 
 
-def test_lines_that_are_not_filled_in_are_refused_by_name(tmp_path):
-    text = _draft(tmp_path, "tau2", "theta1", "theta2").text
-    for key in (name for name in specs["acrobot"].parameters if name != "g"):
-        (tmp_path / "rig.toml").write_text(re.sub(rf"(?m)^# (?!{key} )(\w+) = \.\.\.", r"\1 = 0.2", text))
-        with pytest.raises(RigError, match=rf"rig.toml: \[model\] {key}: missing .*write {key} = 0.2"):
-            read_rig(tmp_path / "rig.toml", specs)
-
-
-FROM_ZERO = {  # columns, then inputs and joints, and the names that the notes ask for
-    "all": (("u0", "u1", "q0", "q1"), {"u0": 1, "u1": 2}, ["theta1", "theta2"]),
-    "one input": (("u0", "q0", "q1", "dq1"), {"u0": 1}, ["theta1", "theta2", "dtheta2"]),
-    "inputs only": (("u0", "u1", "theta1", "theta2"), {"u0": 1, "u1": 2}, []),
-    "states only": (("u2", "q0", "q1"), {"u2": 2}, ["theta1", "theta2"]),
+MAPPED = {  # columns, then inputs with their joints, and lines of [import.columns]
+    "from 0": (("u0", "u1", "q0", "q1"), {"u0": 1, "u1": 2}, ['"theta1" = "q0"', '"theta2" = "q1"']),
+    "states from 0": (("u2", "q0", "dq1"), {"u2": 2}, ['"theta1" = "q0"', '"dtheta2" = "dq1"']),
+    "other names": (("u", "q1", "qdot1"), {"u": 2}, ['"theta1" = "q1"', '"dtheta1" = "qdot1"']),
+    "degrees": (("u", "theta1 [deg]"), {"u": 2}, ['"theta1" = { from = "theta1 [deg]", scale = 0.0174532925 }']),
+    "a torque": (("tau1_mNm", "theta1"), {"tau1": 1}, ['"tau1" = { from = "tau1_mNm", scale = 0.001 }']),
+    "SI": (("tau1 [Nm]", "theta1"), {"tau1": 1}, ['"tau1" = "tau1 [Nm]"']),
+    "twice": (("u", "angle1", "theta1"), {"u": 2}, []),
 }
 
 
-@pytest.mark.parametrize("names, inputs, states", FROM_ZERO.values(), ids=FROM_ZERO)
-def test_joints_that_a_log_counts_from_0(tmp_path, names, inputs, states):
-    zero = [name for name in names if ("u0" in names and name[0] == "u") or name[:2] == "dq"]
+@pytest.mark.parametrize("names, inputs, lines", MAPPED.values(), ids=MAPPED)
+def test_columns_with_other_names_or_units_are_mapped(tmp_path, names, inputs, lines):
     drafted = _draft(tmp_path, *names, system="acrobot")
-    assert f"columns = {list(inputs)}".replace("'", '"') in drafted.text
-    assert f"joints = {list(inputs.values())}" in drafted.text
-    said = "; ".join(drafted.notes)
-    assert re.findall(r"name it '(\w+)'", said) == states
-    noted = dict(re.findall(r"column '(\w+)': counted from 0, so taken for joint (\d)", said))
-    assert noted == {name: str(int(name[-1]) + 1) for name in (*inputs, *names) if name[0] == "q" or name in zero}
-
-
-@pytest.mark.parametrize("system", [*(name for name, spec in specs.items() if not spec.declare), "cart"])
-def test_every_machine_can_be_drafted_and_one_of_ones_own(tmp_path, system):
-    """What is drafted and filled in is read."""
-    cart = SystemSpec(("x", "theta1", "dx", "dtheta1"), ("mc", "stiffness", "mu"), {"lag": 0.0}, joints=2, driven=2)
-    known = {**specs, "cart": cart}
-    path = tmp_path / "01.csv"
-    write_csv(path, _log("u", known[system].states[0]))
-    drafted = draft(path, system, known)
-    assert drafted.missing == {"model": [name for name in known[system].parameters if name != "g"]}
+    assert re.findall(r'(?m)^".*', drafted.text.partition("[import.columns]")[2]) == lines
+    assert drafted.mapped == bool(lines)
     (tmp_path / "rig.toml").write_text(_filled(drafted.text))
-    rig = read_rig(tmp_path / "rig.toml", known)
-    assert rig.input_joints == (2 if system in ("acrobot", "cart") else 1,)
+    rig = read_rig(tmp_path / "rig.toml", specs)
+    assert dict(zip(rig.input_columns, rig.input_joints, strict=True)) == inputs
 
 
-NOTES = {  # columns, then the notes
-    "degrees": (("u", "theta1_deg"), "column 'theta1_deg': name it 'theta1' and convert it from deg to rad"),
-    "brackets": (("u", "theta1 [deg]"), "column 'theta1 [deg]': name it 'theta1' and convert it from deg to rad"),
-    "other names": (("u", "q1", "qdot1"), "column 'q1': name it 'theta1'; column 'qdot1': name it 'dtheta1'"),
-    "dots": (("u", "theta1", "theta1_dot"), "column 'theta1_dot': name it 'dtheta1'"),
-    "rpm": (("u", "theta1", "speed1_rpm"), "column 'speed1_rpm': name it 'dtheta1' and convert it from rpm to rad/s"),
-    "torque": (("tau1_mNm", "theta1"), "column 'tau1_mNm': convert it from mnm to N m"),
-    "SI in the name": (("tau1 [Nm]", "theta1"), ""),
-    "twice": (("u", "theta1", "angle1"), ""),
+def test_a_machine_of_ones_own_can_be_drafted(tmp_path):
+    cart = SystemSpec(("x", "theta1", "dx", "dtheta1"), ("mc", "stiffness", "mu"), {"lag": 0.0}, joints=2, driven=2)
+    write_csv(tmp_path / "01.csv", _log("u", "x"))
+    drafted = draft(tmp_path / "01.csv", "cart", {"cart": cart})
+    assert drafted.missing == {"model": ["mc", "stiffness", "mu"]}
+    (tmp_path / "rig.toml").write_text(_filled(drafted.text))
+    assert read_rig(tmp_path / "rig.toml", {"cart": cart}).input_joints == (2,)
+
+
+CLOCKS = {  # the clock of a log, and what is drafted
+    "in ms by its name": (lambda t: {"t_ms": 1000 * t}, "dt = 0.02    # s\n"),
+    "in ms": (lambda t: {"time": 1000 * t}, "dt = 20.0    # s; is the clock in ms?"),
+    "none": (lambda t: {}, "# dt = ...    # s; the rows of this log have no times"),
+    "session": (lambda t: {"time": t + 5.0}, 'clock = "session"'),
 }
 
 
-@pytest.mark.parametrize("names, notes", NOTES.values(), ids=NOTES)
-def test_columns_to_rename_or_convert_are_named(tmp_path, names, notes):
-    assert "; ".join(_draft(tmp_path, *names, system="pendulum").notes) == notes
-
-
-MS = "column 't_ms': name it 'time' and convert it from ms to s"
-CLOCKS = {  # the clock of a log as it would be right, and what is noted
-    "in ms by its name": (lambda t: {"t_ms": 1000 * t}, MS),
-    "in ms": (lambda t: {"time": 1000 * t}, "column 'time': rows are 20 s apart: is the clock in ms? write s"),
-    "none": (lambda t: {}, "no column 'time': add one [s], or write [sampling] dt"),
-    "set back": (lambda t: {"time": t - DT * (np.arange(ROWS) > 7)},
-        "line 10, column 'time': time does not run on: remove or correct the row"),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("clock, note", CLOCKS.values(), ids=CLOCKS)
-def test_a_clock_that_is_none_is_noticed(tmp_path, clock, note):
+@pytest.mark.parametrize("clock, line", CLOCKS.values(), ids=CLOCKS)
+def test_the_clock_of_a_log_is_read_or_asked_for(tmp_path, clock, line):
     columns = _log("u", "x")
-    write_csv(tmp_path / "01.csv", clock(columns.pop("time")) | columns)
-    drafted = draft(tmp_path / "01.csv", None, specs)
-    assert drafted.notes == (note,) and (note != MS or f"dt = {DT}" in drafted.text)
-    assert note[:2] != "no" or drafted.missing == {"model": ["m"], "sampling": ["dt"]}
-
-
-def test_jitter_session_lost_columns_and_noise_without_a_signal_are_left_to_the_owner(tmp_path):
-    path, columns = tmp_path / "01.csv", _log("note", t0=5.0)
-    columns["time"][7] += 0.1 * DT
-    write_csv(path, columns)
-    drafted = draft(path, "slide", specs)
-    lists = {"input": ["columns", "joints"], "sampling": ["dt"], "measurement": ["columns"]}
-    assert drafted.missing == {"model": ["m"]} | lists
-    assert "0.018 to 0.022 s apart: resample" in drafted.text and 'clock = "session"' in drafted.text
     noise = np.random.default_rng(0).normal(size=ROWS)
-    write_csv(path, _log("u") | {"x": noise, "dx": 0 * noise})
-    text = draft(path, None, specs).text
-    assert re.search(r"(?m)^# x = ", text) and re.search(r"(?m)^# dx = 0 ", text)
+    write_csv(tmp_path / "01.csv", clock(columns.pop("time")) | columns | {"dx": noise})
+    text = draft(tmp_path / "01.csv", None, specs).text
+    assert line in text and re.search(r"(?m)^x = ", text) and re.search(r"(?m)^# dx = ", text)  # dx: no signal
 
 
-@pytest.mark.parametrize(
-    "names, reason",
-    [
-        (("u", "theta1"), "hidden joint"),
-        (("a", "b"), "no column is named as a state"),
-        (("u", "x", "theta1"), "a coordinate x and an angle are of no machine"),
-        (("u", "x", "theta2"), "a coordinate x and an angle are of no machine"),
-    ],
-)
-def test_a_system_that_cannot_be_told_is_asked_for(tmp_path, names, reason):
-    with pytest.raises(DataError, match=rf"01.csv: line 1: .*{reason}.*; give --system acrobot"):
-        _draft(tmp_path, *names)
-
-
-NO_COLUMNS = {  # the change of a log, and words of the message
-    "decimal commas": (lambda s: s.replace(".", ","), "line 2: found", "decimals with '.'"),
-    "no header": (lambda s: s.split("\n", 1)[1], "line 1 holds numbers: write a header"),
-    "other names": (
-        lambda s: s.replace("time,u,x", "a,b,c"),
-        "line 1: no column is recognised",
-        "names such as time, u",
-    ),
-    "dates": (lambda s: s.replace("\n", "\n2026-"), "column 'time': found '2026-0'; write seconds"),
+NO_MACHINE = {  # columns, the reason
+    "one angle": (("u", "theta1"), "hidden joint.*; give --system acrobot"),
+    "nothing": (("a", "b"), r"nothing looks like joints or torques \(found a, b\); write rig.toml by hand"),
+    "both kinds": (("u", "x", "theta2"), "a coordinate x and an angle are of no machine.*; give --system acrobot"),
 }
 
 
-@pytest.mark.parametrize("change, words", [(c, w) for c, *w in NO_COLUMNS.values()], ids=NO_COLUMNS)
-def test_a_log_without_known_columns_is_refused_and_nothing_is_written(tmp_path, capsys, change, words):
-    path = tmp_path / "log.csv"
-    write_csv(path, _log("u", "x"))
-    path.write_text(change(path.read_text().rstrip()))
-    assert cli.main(["init", str(path), "--system", "slide", "--out", str(tmp_path / "mine")]) == 2
-    said = capsys.readouterr().err
-    for word in words:
-        assert word in said
-    assert [each.name for each in tmp_path.iterdir()] == ["log.csv"]
+@pytest.mark.parametrize("names, reason", NO_MACHINE.values(), ids=NO_MACHINE)
+def test_a_system_that_cannot_be_told_is_asked_for(tmp_path, names, reason):
+    with pytest.raises(DataError, match=rf"01.csv: .*{reason}"):
+        _draft(tmp_path, *names)
 
 
 def test_the_command_writes_once_and_never_over(tmp_path, capsys):
@@ -198,31 +134,169 @@ def test_the_command_writes_once_and_never_over(tmp_path, capsys):
     argv = ["init", str(tmp_path / "bench/train/01.csv")]
     assert cli.main(argv) == 0
     said = capsys.readouterr().err
-    assert "in the log: column 'x_mm': name it 'x' and convert it from mm to m" in said
-    assert f"wrote {tmp_path / 'bench/rig.toml'}; fill in [model] m; [measurement] columns" in said
+    assert f"other names or units: then nnap-em import {argv[1]} --rig {tmp_path / 'bench/rig.toml'}" in said
+    assert f"wrote {tmp_path / 'bench/rig.toml'}; fill in [model] m\n" in said
     first = (tmp_path / "bench/rig.toml").read_bytes()
     assert cli.main([*argv, "--system", "slide"]) == 2
     assert "rig.toml: is there already; give another --out" in capsys.readouterr().err
     assert (tmp_path / "bench/rig.toml").read_bytes() == first
-    assert cli.main([*argv, "--out", str(tmp_path / "new")]) == 0
-    assert sorted(path.name for path in (tmp_path / "new").iterdir()) == ["rig.toml"]
     assert cli.main(["init", str(tmp_path / "log.txt"), "--out", str(tmp_path / "other")]) == 2
     assert not (tmp_path / "other").exists()
 
 
 def test_the_shared_rigs_are_drafted_as_their_owners_declared_them(shared, tmp_path):
-    paths = data_sets(shared)
+    paths = [path for path in data_sets(shared) if not specs[read_rig(path, specs).system].declare]
     assert paths
     for path in paths:
         owner = read_rig(path, specs)
-        if specs[owner.system].declare:
-            continue  # a machine from a file: test_draft_machine.py
         drafted = draft(sorted((path.parent / "train").glob("*.csv"))[0], owner.system, specs)
-        assert not drafted.notes
+        assert not drafted.mapped
         (tmp_path / "rig.toml").write_text(_filled(drafted.text))
         rig = read_rig(tmp_path / "rig.toml", specs)
         assert (rig.dt, rig.clock) == (owner.dt, owner.clock)
-        assert rig.measured[: len(owner.measured)] == owner.measured  # an owner may leave out the rates of a file
+        assert set(owner.measured) <= set(rig.measured)  # an owner may leave out the rates of a file
         assert dict(zip(rig.input_columns, rig.input_joints, strict=True)) == dict(
             zip(owner.input_columns, owner.input_joints, strict=True)
         )
+
+
+# --- topics
+
+
+@pytest.mark.parametrize("command, inputs", [("/effort_controller/commands", "data[0]"), (None, "effort[hip]")])
+def test_a_robot_is_drafted_and_imported(tmp_path, command, inputs):
+    log = robot_log(tmp_path / "a.mcap", command)
+    assert cli.main(["init", str(log), "--system", "acrobot"]) == 0
+    path = tmp_path / "rig.toml"
+    path.write_text(_filled(path.read_text()))
+    rig = read_rig(path, specs)
+    assert (rig.dt, rig.measured) == (0.004, ("theta1", "theta2", "dtheta1", "dtheta2"))
+    assert dict(zip(rig.input_columns, rig.input_joints, strict=True)) == {"tau1": 1, "tau2": 2}
+    assert rig.noise_std["theta1"] == pytest.approx(1e-3, rel=0.1)  # the median of 2000 third differences
+    assert f'"tau1" = "{command or "/joint_states"}:{inputs}"' in path.read_text()
+    argv = ["import", str(log), "--rig", str(path), "--out", str(tmp_path / "out"), "--test", "0"]
+    assert cli.main(argv) == 0
+    assert (tmp_path / "out/train/000.csv").read_text().startswith("time,tau1,tau2,theta1,theta2,dtheta1,dtheta2\n")
+
+
+def test_hdf5_names_of_a_json_log_and_the_order_of_joints(tmp_path):
+    groups = {"arm": {"time": T, "q": Q, "qd": V}, "motor": {"time": T, "tau": np.cos(T)}}
+    drafted = draft(write_hdf5(tmp_path / "a.h5", groups), "pendubot", specs)
+    for line in ('"theta2" = "/arm:q[1]"', '"dtheta1" = "/arm:qd[0]"', '"tau" = "/motor:tau"', "dt = 0.004"):
+        assert line in drafted.text
+    notes = [{"pos": float(q), "vel": float(v), "u": 0.5} for q, v in zip(Q[:, 0], V[:, 0], strict=True)]
+    drafted = draft(write_mcap(tmp_path / "a.mcap", {"/slide": (plain_json(), ns(T), notes)}), None, specs)
+    assert 'type = "slide"' in drafted.text and '"dx" = "/slide:vel"' in drafted.text
+    topic = Topic("/js", "", None, ("position[hip]", "position[knee]", "velocity[knee]"))
+    assert {name: str(at) for name, at in found_columns([topic])[0].items()} == {
+        "theta1": "/js:position[hip]", "theta2": "/js:position[knee]", "dtheta2": "/js:velocity[knee]"
+    }  # fmt: skip
+
+
+def test_runs_with_times_of_day_are_drafted(tmp_path):
+    """Silences between runs are no readings without noise."""
+    rows, rng = ["Date,Time,Torque [Nm],Angle [deg]"], np.random.default_rng(0)
+    for run in range(4):
+        for k in range(300):
+            angle = 20 * np.sin(0.05 * k) + 0.1 * rng.normal()
+            rows.append(f"03.11.2026,12:{10 * run:02}:{k / 100:06.3f},{np.cos(0.1 * k):.6f},{angle:.6f}")
+    (tmp_path / "a.csv").write_text("\n".join(rows) + "\n")
+    text = draft(tmp_path / "a.csv", "pendulum", specs).text
+    assert "dt = 0.01 " in text and '"Torque" = "Torque [Nm]"' in text and '"theta1" = { from = "Angle [deg]"' in text
+    noise = float(re.search(r"(?m)^theta1 = ([\d.e-]+) ", text)[1])
+    assert noise == pytest.approx(np.radians(0.1), rel=0.2)  # a median of 1,200
+
+
+BAD = {
+    "one message": ({"pos": 0.1, "vel": 0.0, "u": 0.5}, 1, "its topics have one message each; give a log of a motion"),
+    "no machine": ({"level": 3}, 9, r"joints or torques \(found /a\); write rig.toml"),
+}
+
+
+@pytest.mark.parametrize("note, count, said", BAD.values(), ids=BAD)
+def test_a_log_without_a_motion_of_a_machine_is_refused(tmp_path, note, count, said):
+    log = write_mcap(tmp_path / "a.mcap", {"/a": (plain_json(), ns(T[:count]), [note] * count)})
+    with pytest.raises(DataError, match=rf"a\.mcap: .*{said}"):
+        draft(log, None, specs)
+
+
+# --- a machine in a file
+
+LEG = functools.partial(robot_log, command="/torques/commands", joints=("knee", "hip"))
+"""A robot's log in which the knee stands first."""
+MOTORS = '<motor name="m_hip" joint="hip"/><motor name="m_knee" joint="knee"/>'
+
+
+def _leg(path: Path, motors: str = MOTORS, sensors: str = "") -> Path:
+    path.parent.mkdir(exist_ok=True)
+    path.write_text(f"""
+<mujoco model="leg"><compiler angle="radian"/><worldbody>
+  <body name="thigh"><joint name="hip" axis="0 1 0" armature="0.02"/>
+    <inertial pos="0 0 -0.2" mass="1.5" diaginertia="0.02 0.02 0.002"/>
+    <body name="shank" pos="0 0 -0.4"><joint name="knee" axis="0 1 0"/>
+      <inertial pos="0 0 -0.2" mass="1.0" diaginertia="0.01 0.01 0.001"/></body></body>
+</worldbody><actuator>{motors}</actuator><sensor>{sensors}</sensor></mujoco>""")
+    return path
+
+
+@pytest.mark.parametrize(
+    ("command", "motors", "inputs"),
+    [
+        ("/torques/commands", MOTORS, {"m_hip": "/torques/commands:data[0]", "m_knee": "/torques/commands:data[1]"}),
+        (None, "", {"tau_hip": "/joint_states:effort[hip]", "tau_knee": "/joint_states:effort[knee]"}),
+    ],
+)
+def test_a_robot_of_a_file_is_drafted_and_imported(tmp_path, command, motors, inputs):
+    model = _leg(tmp_path / "models" / "leg.xml", motors)
+    log, bench = LEG(tmp_path / "a.mcap", command=command), tmp_path / "bench"
+    assert cli.main(["init", str(log), "--model", str(model), "--out", str(bench)]) == 0
+    text = (bench / "rig.toml").read_text()
+    assert 'file = "../models/leg.xml"' in text
+    assert all(f'"{name}" = "{at}"' in text for name, at in inputs.items())
+    rig = read_rig(bench / "rig.toml", specs)
+    assert (rig.dt, rig.measured, rig.input_columns) == (0.004, ("hip", "knee", "dhip", "dknee"), tuple(inputs))
+    assert rig.input_joints == (1, 2)
+    out = tmp_path / "out"
+    assert cli.main(["import", str(log), "--rig", str(bench / "rig.toml"), "--out", str(out), "--test", "0"]) == 0
+    q = np.asarray(read_logs(out / "train", read_rig(out / "rig.toml", specs)).data.y)[0, :, :2]
+    np.testing.assert_allclose(q, Q[: len(q)], atol=6e-3)  # the knee is the knee, although it stands first
+
+
+def test_servos_and_uncertain_numbers_of_a_file_are_drafted_by_taking_marks_away(tmp_path):
+    """A measured effort is not taken for the goal of a servo."""
+    model = _leg(tmp_path / "leg.xml", '<position name="m_hip" joint="hip" kp="40" kv="2"/>')
+    made = draft_machine(LEG(tmp_path / "a.mcap", command="/goals/commands"), model, tmp_path)
+    assert '# [input."m_hip"]    # the goal of a position servo; in the file kp = 40, kd = 2' in made.text
+    none = draft_machine(LEG(tmp_path / "b.mcap", command=None), model, tmp_path)
+    assert "effort" not in none.text.partition("[import")[0]
+    made = draft_machine(LEG(tmp_path / "a.mcap"), _leg(tmp_path / "leg.xml"), tmp_path)
+    (tmp_path / "rig.toml").write_text(re.sub(r'(?m)^# ("\w+\.\w+" = )', r"\1", made.text))
+    rig = read_rig(tmp_path / "rig.toml", specs)
+    assert {name: (p.mean, p.std) for name, p in rig.parameters.items()} == {
+        "thigh.mass": (1.5, 0.15), "shank.mass": (1.0, 0.1), "hip.armature": (0.02, 0.02), "knee.armature": (0.0, 0.01),
+    }  # fmt: skip
+
+
+HEADERS = {  # header of a log, its readings, and lines of [import.columns]
+    "time,hip,knee,m_hip": (("hip", "knee"), []),
+    "t,hip_encoder,knee,tau_hip": (("hip_encoder", "knee"), ['"m_hip" = "tau_hip"']),
+    "t,q0,q1,u": (("hip", "knee"), ['"hip" = "q0"', '"knee" = "q1"', '"m_hip" = "u"']),
+}
+
+
+@pytest.mark.parametrize("header, measured, lines", [(h, *rest) for h, rest in HEADERS.items()], ids=HEADERS)
+def test_plain_columns_by_names_of_joints_sensors_and_by_number(tmp_path, header, measured, lines):
+    sensors = '<jointpos name="hip_encoder" joint="hip"/>'
+    model, path = _leg(tmp_path / "leg.xml", '<motor name="m_hip" joint="hip"/>', sensors), tmp_path / "log.csv"
+    np.savetxt(path, np.column_stack([T, Q, T**2]), delimiter=",", header=header, comments="", fmt="%.9g")
+    text = draft_machine(path, model, tmp_path).text
+    (tmp_path / "rig.toml").write_text(text)
+    rig = read_rig(tmp_path / "rig.toml", specs)
+    assert (rig.measured, rig.input_columns, rig.dt) == (measured, ("m_hip",), 0.004)
+    assert re.findall(r'(?m)^".*', text.partition("[import.columns]")[2]) == lines
+
+
+def test_a_log_of_another_machine_is_refused_by_names(tmp_path):
+    log = LEG(tmp_path / "a.mcap", joints=("shoulder", "elbow"), command=None)
+    with pytest.raises(DataError, match=r"a\.mcap: nothing in it is called as a joint of .*leg\.xml \(hip, knee\)"):
+        draft_machine(log, _leg(tmp_path / "leg.xml"), tmp_path)

@@ -14,12 +14,12 @@ from helpers import file_rig, written_again
 from machines import arm
 
 from nnap_em.data.dataset import Dataset
-from nnap_em.data.rig import RigError, RigWarning, read_rig
+from nnap_em.data.rig import RigError, read_rig
 from nnap_em.em.build import build_system
 from nnap_em.export.mjcf import write_mjcf
 from nnap_em.fit.identify import begin
 from nnap_em.machines.mjcf import Part, read_machine
-from nnap_em.machines.source import MachineError
+from nnap_em.machines.spec import MachineError
 from nnap_em.systems import specs
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -93,18 +93,13 @@ def _whole(machine: str) -> mujoco.MjModel:
 
 
 CASES = {  # name: (machine, what is held, joints that are held besides)
-    "a chain, two joints in the middle": (arm(5), "locked = { joint2 = 0.7, joint4 = -1.1 }", {}),
     "a chain, its base and its end": (
         arm(4), 'joints = ["joint2", "joint3"]\nlocked = { joint4 = 0.4 }', {"joint1": 0.0},
     ),
     "a tree": ((ROOT / "tests/machines/branch.xml").read_text(), "locked = { left = -0.6, trunk_x = 0.2 }", {}),
-    "a gripper": (GRIPPER, "locked = { finger1 = 0.02, finger2 = 0.021 }", {}),
     "a gripper that follows": (
         GRIPPER, 'joints = ["yaw", "wrist"]\nlocked = { finger1 = 0.02 }',
         {"finger2": 0.021, "elbow": 0.1, "slide": 0.0, "tool": 0.0},
-    ),
-    "a hand held between and behind": (
-        GRIPPER, "locked = { finger1 = 0.0, finger2 = 0.0, tool = 0.9, slide = 0.05 }", {},
     ),
     "a hand turned about its middle joint": (
         GRIPPER, "locked = { finger1 = 0.0, finger2 = 0.0, wrist = 0.9, elbow = 0.0 }", {},
@@ -191,21 +186,13 @@ def test_a_free_base_that_is_held_is_no_joint(tmp_path):
     assert held.bodies[0].mass == without.bodies[1].mass
 
 
-def test_a_link_without_mass_joins_the_one_that_carries_it(tmp_path):
-    path = _rig(tmp_path, URDF, "locked = { finger1 = 0.01, finger2 = 0.01 }", "g.urdf", "wrist")
-    with pytest.warns(RigWarning, match=r"body 'right' hangs on the locked joint 'finger2' and has no mass"):
-        read_rig(path, specs)
-
-
 BAD = {
     "an unknown joint is held": (GRIPPER, "locked = { elbo = 0.0 }", r"locked names 'elbo', .*did you mean 'elbow'"),
-    "an unknown joint moves": (GRIPPER, 'joints = ["yow"]', r"joints names 'yow', .*did you mean 'yaw'"),
     "a coupling stays": (GRIPPER, "locked = { finger2 = 0.0 }", r"equality .* \[model\] locked = \{ finger1 = 0.0 \}"),
-    "a coupling of the whole": (GRIPPER, "", r"equality .* \[model\] locked = \{ finger1 = 0.0, finger2 = 0.0 \}"),
     "a mimic stays": (
         URDF,
         "locked = { finger2 = 0.0 }",
-        r"'finger2' mimics .* locked = \{ finger1 = 0.0, finger2 = 0.0 \}",
+        r"1 equality .*<mimic> out.* locked = \{ finger1 = 0.0 \}",
     ),
     "both": (
         GRIPPER,
@@ -230,16 +217,11 @@ def test_what_cannot_be_held_is_refused_with_the_line_to_add(machine, line, said
         read_rig(_rig(tmp_path, machine, line, measured="yaw"), specs)
 
 
-def test_a_written_rig_holds_the_same_joints(tmp_path):
-    path = _rig(tmp_path, GRIPPER, 'joints = ["yaw", "wrist"]\nlocked = { finger1 = 0.02 }', measured="yaw")
-    rig = read_rig(path, specs)
-    assert written_again(rig, tmp_path) == rig
-
-
 def test_a_part_is_written_back_as_the_part(tmp_path):
     """Without the held joints and what hung on them; sites of joined bodies stand where they stood."""
     line = "locked = { finger1 = 0.0, finger2 = 0.0, wrist = 0.9, elbow = 0.0 }"
     rig = read_rig(_rig(tmp_path, GRIPPER, line, measured="yaw"), specs)
+    assert written_again(rig, tmp_path) == rig
     rig = dataclasses.replace(rig, measured=("yaw", "slide", "tool"), friction=False)
     t = 0.01 * np.arange(30.0)[None]
     logs = Dataset(t, np.zeros((1, 30, 0)), np.repeat(np.sin(t)[..., None], 3, axis=2), np.ones((1, 30), bool))

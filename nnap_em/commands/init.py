@@ -8,20 +8,17 @@ examples:
   nnap-em init log.csv --model equations --out mine  states, inputs and rates to be written as formulas
 
 Reads columns, units, sample interval and noise off the log.  What it cannot read stands as a line  # key = ...  to be
-filled in.  Names the columns to rename or to convert.  A rig.toml that is there is never overwritten.
+filled in.  Columns with other names or units are mapped in [import.columns], by which nnap-em import reads the log.  A
+rig.toml that is there is never overwritten.
 """
 
 import argparse
 from pathlib import Path
 
 from ..data.dataset import DataError
-from ..data.formats import csv_table
-from ..import_.recording import last_word
-from ..import_.text_file import plain_csv
+from ..init.draft import draft
 from ..init.equations import draft_equations
-from ..init.from_log import draft
 from ..init.from_machine import draft_machine
-from ..init.from_topics import draft_recorded
 from ..storage.files import replace_text
 from ..storage.log import Log
 from ..systems import specs
@@ -38,14 +35,9 @@ def run(args: argparse.Namespace, log: Log) -> None:
     elif args.model is not None:
         drafted = draft_machine(args.log, args.model, path.parent)
     else:
-        drafted = (draft if _ours(args.log) else draft_recorded)(args.log, args.system, specs)
+        drafted = draft(args.log, args.system, specs)
     replace_text(path, drafted.text)
-    for note in drafted.notes:
-        log(f"in the log: {note}")
+    if drafted.mapped:
+        log(f"the log has other names or units: then nnap-em import {args.log} --rig {path} --out FOLDER")
     missing = "; ".join(f"[{table}] {', '.join(keys)}" for table, keys in drafted.missing.items())
     log(f"wrote {path}" + (f"; fill in {missing}" if missing else ""))
-
-
-def _ours(path: Path) -> bool:
-    """True for a CSV file that may stand in train/ as it is, but for names and units."""
-    return plain_csv(path) and all(last_word(name) == name for name in csv_table(path).names)

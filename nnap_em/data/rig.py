@@ -8,7 +8,7 @@ import math
 import re
 import tomllib
 import warnings
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -19,7 +19,6 @@ from .limits import UNBOUNDED, Bounds, read_bounds, read_range
 from .machine import machine_unit, unpacked
 from .servo import AT, TORQUE, Drive, key_of, read_drives, scaled
 from .servo import keys as drive_keys
-from .servo import lines as drive_lines
 from .servo import named as drive_numbers
 from .units import factor, named_unit, parameter_unit, quantities, with_names
 
@@ -213,7 +212,8 @@ class Rig:
 def read_rig(path: Path | str, systems: Mapping[str, SystemSpec]) -> Rig:
     """`nnap_em.read_rig` for some registered machines, by name.
 
-    Raises RigError at the first mistake.
+    Raises RigError with all mistakes, a line each; those of readings, starts and limits, which depend on the model,
+    follow once that is right.
     """
     path = Path(path)
     root = whole_table(path)
@@ -222,43 +222,47 @@ def read_rig(path: Path | str, systems: Mapping[str, SystemSpec]) -> Rig:
         root.refuse("format")
     model, sampling, start = root.table("model"), root.table("sampling"), root.table("start", absent={})
     system = model.choice("type", systems)
-    declaration = (systems[system].declare or partial(_declared, spec=systems[system]))(root)
-    spec = declaration.spec
-    sampling.check(("dt", "input_hold", "clock"), ("horizon",) if declaration.equations else ())
-    start.check((), spec.states)
-    measured, noise_std, ranges = _measurement(root.table("measurement"), spec, bool(declaration.equations))
-    kinds = ("unknown", "none")
-    friction = "none" if declaration.equations else model.choice("friction", kinds)
-    clocks = ("sequence", "session")
-    rig = Rig(
-        name=root.text("name"),
-        system=system,
-        parameters=declaration.parameters,
-        friction=friction != "none",
-        input_columns=declaration.input_columns,
-        input_joints=declaration.input_joints,
-        dt=sampling.positive("dt"),
-        clock=sampling.choice("clock", clocks),
-        input_hold=sampling.choice("input_hold", (HOLD, SMOOTH)),
-        measured=measured,
-        noise_std=noise_std,
-        start={state: start.declared(state) for state in start.items},
-        limits=read_bounds(root.table("limits", absent={}), declaration.input_columns, spec.states),
-        machine=declaration.machine,
-        input_kinds=declaration.input_kinds,
-        input_scales=declaration.input_scales,
-        equations=declaration.equations,
-        ranges=ranges,
-        horizon=sampling.positive("horizon") if "horizon" in sampling.items else None,
-        file=declaration.file,
-        urdf=declaration.urdf,
+    rows = ("dt", "input_hold", "clock")
+    first = every(
+        name=lambda: root.text("name"),
+        of=lambda: (systems[system].declare or partial(_declared, spec=systems[system]))(root),
+        keys=lambda: sampling.check(rows, ("horizon",)),
+        dt=lambda: sampling.positive("dt"),
+        clock=lambda: sampling.choice("clock", ("sequence", "session")),
+        input_hold=lambda: sampling.choice("input_hold", (HOLD, SMOOTH)),
+        horizon=lambda: sampling.positive("horizon") if "horizon" in sampling.items else None,
     )
+    of: dict[str, Any] = first.pop("of")._asdict()
+    spec, equations = of.pop("spec"), bool(of["equations"])
+    second = every(
+        friction=lambda: not equations and model.choice("friction", ("unknown", "none")) != "none",
+        keys=lambda: (start.check((), spec.states), equations or sampling.check(rows)),
+        readings=lambda: _measurement(root.table("measurement"), spec, equations),
+        start=lambda: every(**{state: partial(start.declared, state) for state in spec.states if state in start.items}),
+        limits=lambda: read_bounds(root.table("limits", absent={}), of["input_columns"], spec.states),
+    )
+    del first["keys"], second["keys"]
+    rig = Rig(system=system, **of, **first, **second.pop("readings"), **second)
     for column in (*rig.logged_inputs, *rig.measured):
         named, unit = named_unit(column, brackets=True)[1], rig.column_unit(column)
         if named and factor(named, unit) not in (1.0, None):
             hint = f'call it otherwise, and let `nnap-em import` read it: [import.columns] NAME = "{column}"'
             raise RigError(f"{path}: column {column!r}: in {named} by its name, but read in {unit}; {hint}")
     return rig
+
+
+def every(**reads: Callable[[], Any]) -> dict[str, Any]:
+    """Results by name; RigError with the mistakes of all, a line each."""
+    out, mistakes = {}, {}
+    for name, read in reads.items():
+        try:
+            out[name] = read()
+        except RigError as error:
+            mistakes[str(error)] = error
+    if mistakes:
+        first, *others = mistakes.values()
+        raise RigError("\n".join(mistakes)) from None if others else first
+    return out
 
 
 def write_rig(rig: Rig, path: Path | str) -> None:
@@ -273,83 +277,90 @@ def write_rig(rig: Rig, path: Path | str) -> None:
         >>> nnap_em.read_rig(f"{folder}/copy.toml") == rig
         True
     """
-    scales = {name: f", {AT} = {{ {_columns(scale)} }}" for name, scale in rig.input_scales.items()}
-    parameters = {
-        name: repr(x.mean) if x.std == 0 and name not in scales else _pair(x, scales.get(name, ""))
-        for name, x in rig.parameters.items()
-    }
-    bodies = [f"{dotted_key(key)} = {parameters[key]}    # {rig.unit(key)}" for key in rig.bodies]
-    lines = ["format = 1", f"name = {toml_text(rig.name)}", "", "[model]", f"type = {toml_text(rig.system)}"]
-    lines += [f"file = {toml_text(unpacked(rig.machine).file)}", *_part(rig)] if rig.machine else bodies
-    lines += _equations(rig) if rig.equations else _joints(rig, parameters, bodies)
-    lines += [
-        "",
-        "[sampling]",
-        f"dt = {rig.dt!r}    # s",
-        f"input_hold = {toml_text(rig.input_hold)}",
-        f"clock = {toml_text(rig.clock)}",
-        *([f"horizon = {rig.horizon!r}    # s"] if rig.horizon else []),
-    ]
-    readings = json.loads(rig.equations)["readings"] if rig.equations else {}
-    reads = {name: readings.get(name, name) for name in rig.measured}
-    names = f"[{', '.join(map(toml_text, rig.measured))}]"
-    lines += ["", "[measurement]", f"columns = {_inline(reads) if readings else names}"]
-    lines += [f"range = {_inline({name: list(ends) for name, ends in rig.ranges.items()})}"] if rig.ranges else []
-    lines += ["", "[measurement.noise_std]"]
-    lines += [f"{dotted_key(name)} = {std!r}    # {rig.unit(name)}" for name, std in rig.noise_std.items()]
-    lines += ["", "[start]    # prior of the first row"]
-    lines += [f"{toml_key(name)} = {_pair(x)}    # {rig.unit(name)}" for name, x in rig.start.items()]
-    lines += _limits(rig.limits)
+    lines = ["format = 1", f"name = {toml_text(rig.name)}", *_written(_tables(rig), (), partial(_unit_of, rig))]
     replace_text(Path(path), "\n".join(lines) + "\n")
 
 
-def _joints(rig: Rig, parameters: Mapping[str, str], bodies: Sequence[str]) -> list[str]:
-    """Friction and inputs of a machine with joints."""
-    friction = "unknown" if rig.friction else "none"
-    lines = [f'friction = "{friction}"    # static map velocity -> torque in each joint']
-    lines += ["", "[model.uncertain]", *bodies] if rig.machine and bodies else []
-    unit = "" if rig.input_kinds else "    # N m, or N on a slide"
-    lines += ["", "[input]", f"columns = [{', '.join(map(toml_text, rig.input_columns))}]{unit}"]
-    lines += [] if rig.machine and unpacked(rig.machine).motored else [f"joints = {list(rig.input_joints)}"]
-    units = {key: f"{value}    # {rig.unit(key)}" for key, value in parameters.items()}
-    return [*lines, *drive_lines(rig.kinds, units, toml_text)]
-
-
-def _equations(rig: Rig) -> list[str]:
-    """States, inputs, rates and unknown terms of equations."""
-    of = json.loads(rig.equations)
-    known = {name: unit for name, unit in of["units"].items() if name in rig.parameters}
-    parts = {key: of[key] for key in ("states", "inputs", "rates")} if not of["function"] else {}
-    lines = [
-        f"{key} = {_inline(names) if all(names.values()) else json.dumps(list(names))}" for key, names in parts.items()
-    ]
-    units = [f"{toml_key(name)} = {toml_text(unit)}" for name, unit in known.items()]
-    lines += ["", "[model.units]", *units] if known else []
-    terms = {name: ("", signals) for name, signals in of["terms"].items()} | dict(of["enters"])
-    entries = {
-        name: {"signals": signals} | ({"enters": port} if port else {}) for name, (port, signals) in terms.items()
+def _tables(rig: Rig) -> dict[str, dict[str, Any]]:
+    """Content of rig.toml."""
+    at = {name: {AT: dict(scale)} for name, scale in rig.input_scales.items()}
+    numbers = {
+        name: x.mean if x.std == 0 and name not in at else dataclasses.asdict(x) | at.get(name, {})
+        for name, x in rig.parameters.items()
     }
-    return lines + (
-        ["", "[model.unknown]", *(f"{toml_key(n)} = {_inline(entry)}" for n, entry in entries.items())] if terms else []
-    )
+    bodies, friction = {name: numbers[name] for name in rig.bodies}, "unknown" if rig.friction else "none"
+    inputs: dict[str, Any] = {"columns": rig.input_columns, "joints": rig.input_joints}
+    columns: Any = rig.measured
+    if rig.equations:
+        of, inputs = json.loads(rig.equations), {}
+        parts = {} if of["function"] else {key: of[key] for key in ("states", "inputs", "rates")}
+        model = numbers | {key: names if all(names.values()) and names else list(names) for key, names in parts.items()}
+        model["units"] = {name: unit for name, unit in of["units"].items() if name in rig.parameters}
+        model["unknown"] = {name: {"signals": signals} for name, signals in of["terms"].items()}
+        for name, (port, signals) in of["enters"].items():
+            model["unknown"][name] = {"signals": signals, "enters": port}
+        if of["readings"]:
+            columns = {name: of["readings"].get(name, name) for name in columns}
+    elif rig.machine:
+        machine = unpacked(rig.machine)
+        joints, locked = machine.part or (None, ())
+        model = {
+            "file": machine.file,
+            "joints": joints,
+            "locked": dict(locked),
+            "friction": friction,
+            "uncertain": bodies,
+        }
+        inputs["joints"] = None if machine.motored else rig.input_joints
+    else:
+        model = bodies | {"friction": friction}
+    for column, kind in rig.kinds.items():
+        if kind != TORQUE:
+            own = {name.rpartition("."): x for name, x in numbers.items() if name not in bodies}
+            inputs[column] = {"kind": kind} | {key: x for (owner, _, key), x in own.items() if owner == column}
+    measurement = {"columns": columns, "range": rig.ranges, "noise_std": rig.noise_std}
+    return {
+        "model": {"type": rig.system} | model,
+        "input": inputs,
+        "sampling": {"dt": rig.dt, "input_hold": rig.input_hold, "clock": rig.clock, "horizon": rig.horizon},
+        "measurement": measurement,
+        "start": {name: dataclasses.asdict(value) for name, value in rig.start.items()},
+        "limits": {**rig.limits.values, "rate": rig.limits.rate, "start": rig.limits.start},
+    }
 
 
-def _inline(values: Mapping[str, Any]) -> str:
-    """An inline table of texts, numbers and lists of these."""
-    text = lambda value: toml_text(value) if isinstance(value, str) else json.dumps(value, ensure_ascii=False)  # noqa: E731
-    return f"{{ {', '.join(f'{toml_text(name)} = {text(value)}' for name, value in values.items())} }}"
+def _unit_of(rig: Rig, table: tuple[str, ...], key: str) -> str:
+    """Unit of a key of a table, as a comment says it; empty where it has none."""
+    whole = ".".join(table)
+    name = f"{table[-1]}.{key}" if whole.startswith("input.") else key
+    of_numbers = whole.startswith(("model", "input")) and name in rig.parameters
+    if of_numbers or whole in ("measurement.noise_std", "start"):
+        return rig.unit(name)
+    return "s" if whole == "sampling" and key in ("dt", "horizon") else ""
 
 
-def _columns(values: Mapping[str, float]) -> str:
-    """Columns and numbers as an inline table has them."""
-    return ", ".join(f"{toml_text(name)} = {value!r}" for name, value in values.items())
+def _written(tables: Mapping[str, Any], before: tuple[str, ...], unit: Callable[..., str]) -> Iterator[str]:
+    """Lines of tables, each key with its unit; what is None or an empty table is left out."""
+    for name, table in tables.items():
+        place, there = (
+            (*before, name),
+            {key: value for key, value in table.items() if value is not None and value != {}},
+        )
+        inner = {key: x for key, x in there.items() if isinstance(x, Mapping) and "mean" not in x}
+        if there:
+            yield from ("", f"[{'.'.join(map(toml_key, place))}]")
+        for key in (key for key in there if key not in inner):
+            yield f"{toml_key(key)} = {_value(there[key])}" + (f"    # {said}" if (said := unit(place, key)) else "")
+        yield from _written(inner, place, unit)
 
 
-def _part(rig: Rig) -> list[str]:
-    """The joints of the file that move, and those that are held."""
-    joints, locked = unpacked(rig.machine).part or (None, ())
-    lines = [f"joints = [{', '.join(map(toml_text, joints))}]    # those that move"] if joints else []
-    return [*lines, f"locked = {{ {_columns(dict(locked))} }}    # rad or m"] if locked else lines
+def _value(value: Any) -> str:
+    """A value as TOML has it, a table in one line."""
+    if isinstance(value, Mapping):
+        return f"{{ {', '.join(f'{toml_key(key)} = {_value(x)}' for key, x in value.items())} }}"
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(map(_value, value))}]"
+    return toml_text(value) if isinstance(value, str) else repr(value)
 
 
 def toml_text(text: str) -> str:
@@ -360,11 +371,6 @@ def toml_text(text: str) -> str:
 def toml_key(name: str) -> str:
     """A name as a key of TOML, in quotes where it has to be."""
     return name if re.fullmatch(r"[\w-]+", name, re.ASCII) else toml_text(name)
-
-
-def dotted_key(name: str) -> str:
-    """A name with dots as tables inside tables, which `flat` joins again."""
-    return ".".join(map(toml_key, name.split(".")))
 
 
 def flat(items: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, object]]:
@@ -400,11 +406,8 @@ class _Table:
     def check(self, required: Collection[str], optional: Collection[str] = ()) -> None:
         """Refuse unknown keys first: a misspelt key is also a missing one, and its name is the better hint."""
         known = (*required, *optional)
-        for key in self.items:
-            if key not in known:
-                self.refuse(
-                    key, "unknown table or key", nearest(key, [name for name in known if name not in self.items])
-                )
+        left, unknown = [key for key in known if key not in self.items], [key for key in self.items if key not in known]
+        every(**{key: partial(self.refuse, key, "unknown table or key", nearest(key, left)) for key in unknown})
         if missing := [key for key in required if key not in self.items]:
             self._missing(*missing)
 
@@ -442,9 +445,11 @@ class _Table:
             self.refuse(key, hint=f"write a finite number, {key} = 0.2")
         return float(value)
 
-    def quantity(self, key: str, optional: Collection[str] = ()) -> Declared:
+    def quantity(self, key: str, optional: Collection[str] = (), mean: float | None = None) -> Declared:
         """A number (trusted) or { mean, std }, which may have `optional` keys, too."""
-        return self.declared(key, optional) if isinstance(self.value(key), dict) else Declared(self.number(key), 0.0)
+        return (
+            self.declared(key, optional, mean) if isinstance(self.value(key), dict) else Declared(self.number(key), 0.0)
+        )
 
     def positive(self, key: str) -> float:
         value = self.number(key)
@@ -452,12 +457,17 @@ class _Table:
             self.refuse(key, hint=f"write a number above 0, {key} = 0.01")
         return value
 
-    def declared(self, key: str, optional: Collection[str] = ()) -> Declared:
+    def declared(self, key: str, optional: Collection[str] = (), mean: float | None = None) -> Declared:
+        """{ mean, std }; `mean` is that of a machine file, which may be left out."""
         pair = self.table(key)
-        pair.check(("mean", "std"), optional)
+        pair.check(("mean", "std") if mean is None else ("std",), ("mean", *optional))
         if pair.number("std") < 0:
             pair.refuse("std", hint="write a standard deviation of 0 (trusted) or more")
-        return Declared(pair.number("mean"), pair.number("std"))
+        return Declared(pair.number("mean") if "mean" in pair.items else float(mean or 0.0), pair.number("std"))
+
+    def flattened(self) -> "_Table":
+        """The table with dotted keys joined again."""
+        return dataclasses.replace(self, items=dict(flat(self.items)))
 
     def distinct(self, key: str, kind: type) -> tuple:
         value = self.value(key)
@@ -507,7 +517,7 @@ def _declared(root: _Table, spec: SystemSpec) -> Declaration:
     model = root.table("model")
     reserved = ("type", "friction", "actuated_joint")
     model.check(("type", "friction", *spec.parameters), ("actuated_joint", *spec.optional))
-    parameters = {key: _parameter(model, key) for key in model.items if key not in reserved}
+    parameters = every(**{key: partial(_parameter, model, key) for key in model.items if key not in reserved})
     columns, joints, drives = _input(root, model, spec)
     scales = scaled(drives, ("time", *spec.states, *columns), root.table("input", absent={}))
     return Declaration(spec, parameters | drive_numbers(drives), columns, joints, "", kinds_of(drives), scales)
@@ -541,9 +551,7 @@ def _input(root: _Table, model: _Table, spec: SystemSpec) -> tuple[tuple[str, ..
     return columns, joints, drives
 
 
-def _measurement(
-    table: _Table, spec: SystemSpec, formulas: bool
-) -> tuple[tuple[str, ...], dict[str, float], dict[str, tuple[float, float]]]:
+def _measurement(table: _Table, spec: SystemSpec, formulas: bool) -> dict[str, Any]:
     """The measured columns, the noise declared for them, and the ranges of their sensors."""
     table.check(("columns",), ("noise_std", "range"))
     formulas = formulas and isinstance(table.value("columns"), dict)
@@ -554,24 +562,12 @@ def _measurement(
         if column not in spec.states + spec.sensors:
             what = "no state or sensor" if spec.sensors else "no state"
             table.refuse("columns", f"{column!r} is {what} of this system", nearest(column, spec.states + spec.sensors))
-    noise = table.table("noise_std", absent={})
-    noise = dataclasses.replace(noise, items=dict(flat(noise.items)))
+    noise = table.table("noise_std", absent={}).flattened()
     noise.check((), columns)
     ends = table.table("range", absent={})
     ends.check((), columns)
-    ranges = {column: read_range(ends, column) for column in ends.items}
-    return columns, {column: noise.positive(column) for column in noise.items}, ranges
-
-
-def _limits(limits: Bounds) -> list[str]:
-    tables = {"limits": limits.values, "limits.rate": limits.rate, "limits.start": limits.start}
-    return [
-        line
-        for name, table in tables.items()
-        if table
-        for line in ("", f"[{name}]", *(f"{toml_key(key)} = {list(pair)!r}" for key, pair in table.items()))
-    ]
-
-
-def _pair(value: Declared, suffix: str = "") -> str:
-    return f"{{ mean = {value.mean!r}, std = {value.std!r}{suffix} }}"
+    return {
+        "measured": columns,
+        "noise_std": every(**{column: partial(noise.positive, column) for column in noise.items}),
+        "ranges": every(**{column: partial(read_range, ends, column) for column in ends.items}),
+    }

@@ -1,6 +1,6 @@
 """Drives that rig.toml declares: an input is a torque, or the command of a servo with a law of its own."""
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Mapping
 from typing import Any, NamedTuple
 
 TORQUE = "torque"
@@ -155,14 +155,3 @@ def key_of(name: str, kinds: Mapping[str, str]) -> Key | None:
     """Key of a parameter of this name among the drives of some columns; None for one of the machine."""
     column, _, key = name.rpartition(".")
     return KINDS[kinds[column]].get(key) if column in kinds else None
-
-
-def lines(columns: Mapping[str, str], values: Mapping[str, str], text: Any) -> Iterator[str]:
-    """The tables of rig.toml for columns and their kinds; `values` are all parameters as TOML, `text` quotes a name."""
-    for column, kind in columns.items():
-        if kind == TORQUE:
-            continue
-        yield from ("", f"[input.{text(column)}]", f"kind = {text(kind)}")
-        for key in KINDS[kind]:
-            if f"{column}.{key}" in values:
-                yield f"{key} = {values[f'{column}.{key}']}"

@@ -7,8 +7,9 @@ from jaxtyping import Float
 
 from ..data.noise import reading_noise, resolution
 from ..data.rig import toml_text
-from ..data.units import is_time, named_unit
-from .from_log import DRAFT_HEAD, Draft, meaning, numbers, sampling
+from ..import_.files import reader
+from ..import_.recording import Address
+from .draft import HEAD, Draft, columns_table, meaning, sampling
 
 
 def draft_equations(path: Path) -> Draft:
@@ -16,8 +17,9 @@ def draft_equations(path: Path) -> Draft:
 
     Raises DataError where the log cannot be read.
     """
-    table = numbers(path)
-    columns = {name: values for name, values in table.items() if not is_time(name)}
+    names = [Address(topic.name, field) for topic in reader(path).topics(path) for field in topic.fields]
+    table = columns_table(path, {at.path: at for at in names})
+    columns = {name: values for name, values in table.items() if name != "time"}
     inputs = {name for name, values in columns.items() if _input(name, values)}
     inputs = inputs or set(list(columns)[:1])
     readings = [name for name in columns if name not in inputs]
@@ -30,7 +32,7 @@ def draft_equations(path: Path) -> Draft:
         f'states = [{", ".join(map(toml_text, names.values()))}]    # those not read, too; with units: {{ h1 = "V" }}',
         "# Derivatives of the states by time [1/s]; a number is trusted, { mean = 0.05, std = 0.03 } is estimated.",
         '# rates = ...    # such as { x1 = "k*pump - a*sqrt(x1)" }, and then k = { mean = 1.0, std = 1.0 }, ...',
-        *sampling(table, [meaning("time")] if "time" in table else []),
+        *sampling(table),
         "",
         "[measurement]",
         f"columns = {{ {', '.join(f'{toml_text(name)} = {toml_text(state)}' for name, state in names.items())} }}",
@@ -42,10 +44,9 @@ def draft_equations(path: Path) -> Draft:
         "[start]    # the state in the first row, where it is known but not measured",
         *(f"# {state} = {{ mean = 0.0, std = 0.5 }}" for state in names.values()),
     ]
-    head = DRAFT_HEAD.replace("# SI units: s, kg, m, rad, N m.  Fill", "# Units are yours; time is in s.  Fill")
-    units = [f"column {name!r}: its name ends in the unit {unit}" for name in columns if (unit := named_unit(name)[1])]
+    head = HEAD.replace("# SI units: s, kg, m, rad, N m.  Fill", "# Units are yours; time is in s.  Fill")
     title = toml_text(path.resolve().parent.name or "rig")
-    return Draft("\n".join([head.format(name=title), *lines]) + "\n", tuple(units))
+    return Draft("\n".join([head.format(name=title), *lines]) + "\n")
 
 
 def _input(name: str, values: Float[np.ndarray, " time"]) -> bool:

@@ -2,12 +2,13 @@
 
 import warnings
 from collections.abc import Iterator
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from ..data.machine import OF_BODY, PAIRS, SENSE_UNITS, Machine, Motor, Sensor, of_body, packed, states
-from ..data.rig import Declaration, Declared, RigWarning, SystemSpec, flat, kinds_of, nearest
+from ..data.rig import Declaration, Declared, RigWarning, SystemSpec, every, kinds_of, nearest
 from ..data.servo import TORQUE, Drive, read_drives, scaled
 from ..data.servo import keys as drive_keys
 from ..data.servo import named as drive_numbers
@@ -42,7 +43,7 @@ def declare(root: Any) -> Declaration:
     drives = read_drives(root.table("input", absent={}), columns, file_drives)
     gears = tuple(_gear(motors.get(column), drives[column]) for column in columns)
     spec = SystemSpec(machine.states, (), {}, len(machine.joints), sensors=possible)
-    parameters = dict(_parameters(machine, model)) | drive_numbers(drives)
+    parameters = _parameters(machine, model) | drive_numbers(drives)
     machine = packed(machine._replace(gears=gears, motored=motored))
     scales = scaled(drives, ("time", *spec.states, *columns), root.table("input", absent={}))
     return Declaration(
@@ -157,14 +158,15 @@ def _place(machine: Machine, table: Any, joint: Any) -> int:
     return joint
 
 
-def _parameters(machine: Machine, model: Any) -> Iterator[tuple[str, Declared]]:
+def _parameters(machine: Machine, model: Any) -> dict[str, Declared]:
     """Every number of [model.uncertain], its mean that of the file where none is written."""
-    table = model.table("uncertain", absent={})
+    table = model.table("uncertain", absent={}).flattened()
     bodies = {body.name: dict(zip(OF_BODY, of_body(body), strict=True)) for body in machine.bodies}
     means = {f"{body}.{what}": value for body, values in bodies.items() for what, value in values.items()}
     means |= {f"{joint.name}.{what}": float(getattr(joint, what)) for joint in machine.joints for what in OF_JOINT}
     owners = [one.name for one in (*machine.bodies, *machine.joints)]
-    for name, value in flat(table.items):
+
+    def declared(name: str) -> Declared:
         owner, _, quantity = name.partition(".")
         if owner not in owners:
             table.refuse(name, f"no body or joint of {machine.file} is called {owner!r}", nearest(owner, owners))
@@ -172,13 +174,17 @@ def _parameters(machine: Machine, model: Any) -> Iterator[tuple[str, Declared]]:
             known = [key.partition(".")[2] for key in means if key.partition(".")[0] == owner]
             problem = f"{owner!r} has no {quantity!r}" if quantity else "names no number"
             table.refuse(name, problem, nearest(quantity, known))
-        declared = _declared(table, name, value, means[name])
-        if owner in bodies:
-            bodies[owner][quantity] = declared.mean
-        yield name, declared
+        value = table.quantity(name, mean=means[name])
+        if (value.mean < 0 and quantity in ("mass", *OF_JOINT)) or (quantity == "mass" and not value.mean):
+            table.refuse(name, f"found mean = {value.mean:g}", "write a number above 0")
+        return value
+
+    out = every(**{name: partial(declared, name) for name in table.items})
     for body, values in bodies.items():
-        if any(name.startswith(f"{body}.") for name, _ in flat(table.items)):
-            _check_inertia(table, body, values)
+        own = {what: out[f"{body}.{what}"].mean for what in OF_BODY if f"{body}.{what}" in out}
+        if own:
+            _check_inertia(table, body, values | own)
+    return out
 
 
 def _check_inertia(table: Any, body: str, values: dict[str, float]) -> None:
@@ -190,17 +196,3 @@ def _check_inertia(table: Any, body: str, values: dict[str, float]) -> None:
     if low + middle < (1 - 1e-9) * high:
         problem = f"principal inertias of {low:.3g}, {middle:.3g} and {high:.3g} kg m^2"
         table.refuse(f"{body}.inertia", problem, "write means of which the largest is at most the sum of the others")
-
-
-def _declared(table: Any, name: str, value: object, mean: float) -> Declared:
-    pair = value if isinstance(value, dict) else {"mean": value, "std": 0.0}
-    numbers = [pair.get("mean", mean), pair.get("std")]
-    uncertain = "write forearm.mass = { std = 0.1 }, with mean = 1.2 where it is not the file's"
-    if set(pair) - {"mean", "std"} or not all(type(x) in (int, float) and abs(x) < float("inf") for x in numbers):
-        table.refuse(name, f"found {value!r}", uncertain)
-    if numbers[1] < 0:
-        table.refuse(name, f"found std = {numbers[1]}", "write a standard deviation of 0 (trusted) or more")
-    quantity = name.partition(".")[2]
-    if (quantity in ("mass", *OF_JOINT) and numbers[0] < 0) or (quantity == "mass" and not numbers[0]):
-        table.refuse(name, f"found mean = {numbers[0]}", "write a number above 0")
-    return Declared(float(numbers[0]), float(numbers[1]))

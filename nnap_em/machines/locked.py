@@ -4,13 +4,7 @@ from collections.abc import Collection, Mapping
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
-import numpy as np
-
-from ..data.machine import Rotation, Vector
 from .spec import mujoco
-
-NOTHING = 1e-13
-"""Mass [kg] and inertia [kg m^2] that count as none: a hundred times the least that MuJoCo's compiler accepts."""
 
 
 class Part(NamedTuple):
@@ -34,20 +28,6 @@ class Part(NamedTuple):
 def holding(*joints: str) -> str:
     """The line of rig.toml that holds joints."""
     return f"[model] locked = {{ {', '.join(f'{joint} = 0.0' for joint in joints)} }}"
-
-
-class Follows(NamedTuple):
-    """The joint that another follows, and the coefficients of the polynomial by which it does."""
-
-    joint: str
-    law: tuple[float, ...]
-    zero: float = 0.0
-    """Coordinate of the follower at which the polynomial counts from 0, and that of the leader."""
-    of: float = 0.0
-
-    def value(self, leader: float) -> float:
-        """Coordinate of the follower."""
-        return self.zero + sum(c * (leader - self.of) ** k for k, c in enumerate(self.law))
 
 
 def hold(spec: Any, model: Any, part: Part, values: Mapping[str, float]) -> None:
@@ -94,15 +74,3 @@ def _pose(spec: Any, model: Any, held: Collection[int], values: Mapping[str, flo
             model.jnt_axis[j] = turns[i].T @ data.xaxis[j]
             model.jnt_pos[j] = turns[i].T @ (data.xanchor[j] - places[i])
     spec.copy_back(model)
-
-
-def vector(values: np.ndarray) -> Vector:
-    """Three numbers of NumPy as a vector."""
-    x, y, z = (float(value) for value in values)
-    return x, y, z
-
-
-def matrix(values: np.ndarray) -> Rotation:
-    """Nine as a matrix."""
-    a, b, c = (vector(row) for row in values)
-    return a, b, c

@@ -2,19 +2,17 @@
 
 import re
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..data.machine import SENSE_UNITS, Body, Joint, JointSensor, Machine, Motor, Rotation, Sensor, Site
+from ..data.machine import SENSE_UNITS, Body, Joint, JointSensor, Machine, Motor, Rotation, Sensor, Site, Vector
 from ..data.rig import RigWarning, nearest
 from ..data.servo import TORQUE
-from .locked import NOTHING, Follows, Part, hold, holding, matrix, vector
-from .source import parse, refuse
-from .spec import compiled, mujoco, opened, written
-from .urdf import refuse_urdf, warn_of_rotors
+from .locked import Part, hold, holding
+from .spec import NOTHING, compiled, mujoco, opened, refuse, weightless, written
 
 _WHOLE = Part()
 
@@ -37,23 +35,37 @@ def read_machine(path: Path, part: Part = _WHOLE) -> Machine:
 
 def read_file(path: Path, part: Part = _WHOLE) -> MachineFile:
     """`read_machine` with the file itself."""
-    root = parse(path)
-    urdf = root.tag == "robot"
-    if urdf:
-        refuse_urdf(path, root, part)
-        warn_of_rotors(path, root)
-    spec = opened(path, urdf)
-    model = compiled(path, spec) if part.whole else _part(path, spec, part)
+    spec = opened(path)
+    if not part.whole:
+        _hold(path, spec, part)
+    model = weightless(path, spec)
     _refuse_all(path, model, _WHOLE)
+    mass = np.bincount(model.body_weldid, model.body_mass)
+    for j in range(model.njnt):
+        if mass[model.jnt_bodyid[j]] <= NOTHING:
+            hint = "give it an <inertial> with mass and inertia (shapes of URDF weigh nothing)"
+            hint += f", or hold its joint: {holding(model.joint(j).name)}"
+            refuse(path, f"body {model.body(model.jnt_bodyid[j]).name!r} moves and has no mass", hint)
+    model = compiled(path, spec)
     machine = _machine(path, model)
     _refuse_names(path, machine)
     return MachineFile(machine, written(spec))
 
 
+def stuck(path: Path, logged: Collection[str]) -> dict[str, float]:
+    """Values for the joints of a file that move no mass, and for couplings of which a log has neither joint."""
+    model = weightless(path, opened(path))
+    light = model.body_subtreemass[model.jnt_bodyid] <= NOTHING * model.nbody
+    held = {model.joint(j).name: 0.0 for j in np.flatnonzero(light)}
+    for name, (leader, law) in _couplings(model).items():
+        held |= {} if {name, leader} & {*logged} else {leader: 0.0, name: law(0.0)}
+    return held
+
+
 def _machine(path: Path, model: Any) -> Machine:
     return Machine(
         file=path.name,
-        gravity=vector(model.opt.gravity * (model.opt.disableflags & int(mujoco().mjtDisableBit.mjDSBL_GRAVITY) == 0)),
+        gravity=_vector(model.opt.gravity * (model.opt.disableflags & int(mujoco().mjtDisableBit.mjDSBL_GRAVITY) == 0)),
         bodies=_bodies(model),
         joints=tuple(_joint(model, j) for j in range(model.njnt)),
         motors=tuple(_motors(model)),
@@ -63,7 +75,7 @@ def _machine(path: Path, model: Any) -> Machine:
             if (kind := _kind("mjtSensor", model.sensor_type[i])) in ("jointpos", "jointvel")
         ),
         sites=tuple(
-            Site(model.site(i).name, int(model.site_bodyid[i]) - 1, vector(model.site_pos[i]))
+            Site(model.site(i).name, int(model.site_bodyid[i]) - 1, _vector(model.site_pos[i]))
             for i in range(model.nsite)
             if model.site_bodyid[i] > 0
         ),
@@ -71,12 +83,9 @@ def _machine(path: Path, model: Any) -> Machine:
     )
 
 
-def _part(path: Path, spec: Any, part: Part) -> Any:
-    """MuJoCo's model with joints held, and `spec` without them; warns of bodies without mass that join another."""
-    bounds = spec.compiler.boundmass, spec.compiler.boundinertia
-    spec.compiler.boundmass, spec.compiler.boundinertia = (max(bound, 0.1 * NOTHING) for bound in bounds)
-    joined, spec.compiler.fusestatic = spec.compiler.fusestatic, False
-    model = compiled(path, spec)
+def _hold(path: Path, spec: Any, part: Part) -> None:
+    """Free `spec` of the joints that are held; warns of bodies without mass that join another."""
+    model = weightless(path, spec)
     _refuse_unknown(path, model, part)
     _refuse_all(path, model, part)
     single = [j for j in range(model.njnt) if _kind("mjtJoint", model.jnt_type[j]) in ("slide", "hinge")]
@@ -84,24 +93,15 @@ def _part(path: Path, spec: Any, part: Part) -> Any:
     values = {name: part.locked.get(name, zero) for name, zero in zeros.items() if part.holds(name)}
     follows = _couplings(model)
     for _ in follows:  # a joint may follow one that follows another
-        for name, law in follows.items():
-            if name in values and law.joint in values and name not in part.locked:
-                values[name] = law.value(values[law.joint])
+        for name, (leader, law) in follows.items():
+            if name in values and leader in values and name not in part.locked:
+                values[name] = law(values[leader])
     for name in values:
         body = model.body(int(model.joint(name).bodyid[0]))
         if body.mass[0] <= NOTHING or np.sum(body.inertia) <= 10 * NOTHING:
             problem = f"body {body.name!r} hangs on the locked joint {name!r} and has no mass or no inertia"
             warnings.warn(f"{path}: {problem}; it is joined to the body that carries it", RigWarning, 2)
-    spec.compiler.fusestatic = joined
     hold(spec, model, part, values)
-    model = compiled(path, spec)
-    mass = np.bincount(model.body_weldid, model.body_mass)
-    for j in range(model.njnt):
-        if mass[model.jnt_bodyid[j]] <= NOTHING:
-            hint = f"give it an <inertial>, or hold its joint: {holding(model.joint(j).name)}"
-            refuse(path, f"body {model.body(model.jnt_bodyid[j]).name!r} moves and has no mass", hint)
-    spec.compiler.boundmass, spec.compiler.boundinertia = bounds
-    return compiled(path, spec)
 
 
 def _refuse_unknown(path: Path, model: Any, part: Part) -> None:
@@ -121,15 +121,16 @@ def _kind(of: str, value: Any) -> str:
     return getattr(mujoco(), of)(int(value)).name.rpartition("_")[2].lower()
 
 
-def _couplings(model: Any) -> dict[str, Follows]:
-    """The joints that an equality constraint couples to another."""
+def _couplings(model: Any) -> dict[str, tuple[str, Callable[[float], float]]]:
+    """Joints that an equality constraint couples to another: that one, and the coordinate by that of the other."""
     out = {}
     for i in range(model.neq):
-        first, second = int(model.eq_obj1id[i]), int(model.eq_obj2id[i])
-        if _kind("mjtEq", model.eq_type[i]) == "joint" and second >= 0:
-            zeros = (float(model.qpos0[model.jnt_qposadr[j]]) for j in (first, second))
-            law = tuple(float(c) for c in model.eq_data[i][:5])
-            out[model.joint(first).name] = Follows(model.joint(second).name, law, *zeros)
+        pair = int(model.eq_obj1id[i]), int(model.eq_obj2id[i])
+        if _kind("mjtEq", model.eq_type[i]) == "joint" and pair[1] >= 0:
+            zero, of = (float(model.qpos0[model.jnt_qposadr[j]]) for j in pair)
+            terms = np.polynomial.Polynomial(np.array(model.eq_data[i][:5], float))
+            law = lambda leader, zero=zero, of=of, terms=terms: float(zero + terms(leader - of))  # noqa: E731
+            out[model.joint(pair[0]).name] = model.joint(pair[1]).name, law
     return out
 
 
@@ -158,7 +159,7 @@ def _obstacles(model: Any, part: Part) -> Iterator[tuple[str, str]]:
         yield "nothing moves: every joint is held", "leave some out of [model] locked, or name them in joints = [...]"
     if closed := list(_closed(model, held)):
         lines = [model.joint(j).name for j in dict.fromkeys(j for joints in closed for j in sorted(joints))]
-        hint = "a loop or coupling is no tree: take <equality> out"
+        hint = "a loop or coupling is no tree: take <equality> or <mimic> out"
         hint += f", or hold the joints that it closes: {holding(*lines)}" if lines else ""
         yield f"it has {len(closed)} equality constraints" + ("" if part.whole else " on joints that move"), hint
     if loose := sum(not _still(model, i, held) for i in range(model.ntendon)):
@@ -264,10 +265,10 @@ def _bodies(model: Any) -> tuple[Body, ...]:
         Body(
             name=model.body(i).name or f"body{i}",
             parent=int(model.body_parentid[i]) - 1,
-            place=vector(model.body_pos[i]),
+            place=_vector(model.body_pos[i]),
             turn=_rotation(model.body_quat[i]),
             mass=float(model.body_mass[i]),
-            centre=vector(model.body_ipos[i]),
+            centre=_vector(model.body_ipos[i]),
             inertia=_inertia(model, i),
         )
         for i in range(1, model.nbody)
@@ -277,7 +278,7 @@ def _bodies(model: Any) -> tuple[Body, ...]:
 def _inertia(model: Any, i: int) -> Rotation:
     turn = np.asarray(_rotation(model.body_iquat[i]))
     whole = turn @ np.diag(model.body_inertia[i]) @ turn.T
-    return matrix(0.5 * (whole + whole.T))
+    return _matrix(0.5 * (whole + whole.T))
 
 
 def _joint(model: Any, j: int) -> Joint:
@@ -286,8 +287,8 @@ def _joint(model: Any, j: int) -> Joint:
         name=model.joint(j).name,
         body=int(model.jnt_bodyid[j]) - 1,
         slide=_kind("mjtJoint", model.jnt_type[j]) == "slide",
-        axis=vector(model.jnt_axis[j]),
-        anchor=vector(model.jnt_pos[j]),
+        axis=_vector(model.jnt_axis[j]),
+        anchor=_vector(model.jnt_pos[j]),
         zero=float(model.qpos0[place]),
         stiffness=float(np.ravel(model.jnt_stiffness[j])[0]),
         rest=float(model.qpos_spring[place]),
@@ -359,10 +360,20 @@ def _sensors(model: Any) -> Iterator[Sensor]:
         place, turn = (model.site_pos[at], model.site_quat[at]) if at >= 0 else (np.zeros(3), np.array([1.0, 0, 0, 0]))
         body = int(model.site_bodyid[at]) - 1 if at >= 0 else -1
         for axis, letter in enumerate("xyz"):
-            yield Sensor(f"{model.sensor(i).name}.{letter}", kind, axis, body, vector(place), _rotation(turn))
+            yield Sensor(f"{model.sensor(i).name}.{letter}", kind, axis, body, _vector(place), _rotation(turn))
 
 
 def _rotation(quaternion: np.ndarray) -> Rotation:
     turn = np.zeros(9)
     mujoco().mju_quat2Mat(turn, quaternion / np.linalg.norm(quaternion))
-    return matrix(turn.reshape(3, 3))
+    return _matrix(turn.reshape(3, 3))
+
+
+def _vector(values: np.ndarray) -> Vector:
+    x, y, z = (float(value) for value in values)
+    return x, y, z
+
+
+def _matrix(values: np.ndarray) -> Rotation:
+    a, b, c = (_vector(row) for row in values)
+    return a, b, c

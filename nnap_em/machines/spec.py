@@ -7,11 +7,19 @@ import warnings
 from pathlib import Path
 from typing import Any, NoReturn
 
-from ..data.rig import RigWarning
-from .source import MachineError, included, located, refuse
+from ..data.rig import RigError, RigWarning
 
 DIGITS = 15
 """Significant digits of a written number: those that a decimal number keeps as a double; MuJoCo's own are 6."""
+
+
+class MachineError(RigError):
+    """A machine file that cannot be used: the message names the file, the obstacle, and the remedy."""
+
+
+def refuse(path: Path, problem: str, hint: str) -> NoReturn:
+    """Raise MachineError."""
+    raise MachineError(f"{path}: {problem}; {hint}")
 
 
 def mujoco() -> Any:
@@ -28,25 +36,38 @@ def mujoco() -> Any:
     return mujoco
 
 
-def opened(path: Path, urdf: bool) -> Any:
+def opened(path: Path) -> Any:
     """The content of an MJCF or URDF file as an MjSpec; a link of a URDF file without an inertial weighs nothing.
 
-    Raises MachineError at what MuJoCo's parser refuses.
+    Raises MachineError at macros that are not expanded, and at what MuJoCo's parser refuses.
     """
-    parser, heard = mujoco(), []
+    parser, heard, text = mujoco(), [], _text(path)
+    if macro := re.search(r"<xacro:\w+|\$\{[^}\n]*\}|\$\(arg[^)\n]*\)", text):
+        line = text.count("\n", 0, macro.start()) + 1
+        hint = f"expand it first, with xacro {path.name} > expanded.urdf, and give that file"
+        refuse(path, f"line {line}: {macro[0]}{'>' * (macro[0][0] == '<')} is xacro", hint)
     parser.set_mju_user_warning(heard.append)
     try:
         spec = parser.MjSpec.from_file(str(path))
     except ValueError as error:
-        _refuse(path, _in_included(path, _plain(error)))
+        _refuse(path, error)
     finally:
         parser.set_mju_user_warning(None)
     for line in heard:
         if "equal lower and upper limits" not in line:  # a limit without room is none
             warnings.warn(f"{path}: {line}", RigWarning, 2)
-    for body in [body for body in spec.bodies[1:] if urdf and not body.explicitinertial]:
+    for body in [body for body in spec.bodies[1:] if "<robot" in text and not body.explicitinertial]:
         body.explicitinertial, body.ipos = True, [0.0, 0.0, 0.0]
     return spec
+
+
+def _text(path: Path) -> str:
+    """The file without its comments; its tags are ASCII in every encoding."""
+    try:
+        text = path.read_bytes().decode("latin-1")
+    except OSError as error:
+        refuse(path, f"cannot be read ({error.strerror})", "file = names an MJCF or URDF file beside rig.toml")
+    return re.sub(r"(?s)<!--.*?-->", lambda comment: "\n" * comment[0].count("\n"), text)
 
 
 def compiled(path: Path, spec: Any) -> Any:
@@ -54,17 +75,31 @@ def compiled(path: Path, spec: Any) -> Any:
 
     Raises MachineError at what the compiler refuses, and where a mesh is missing that a body takes its mass from.
     """
-    message = ""
-    for without in (None, _without_textures, _without_meshes):
-        if without is not None:
-            without(path, spec)
+    for without in (_without_textures, _without_meshes, None):
         try:
             return spec.compile()
         except ValueError as error:
-            message = _plain(error)
-            if not re.search(r"opening file|resource|not found|reading file|file type", message, re.I):
-                break
-    _refuse(path, _in_file(path, message))
+            if not without or not re.search(
+                r"opening file|resource|not found|reading file|file type", str(error), re.I
+            ):
+                _refuse(path, error)
+            without(path, spec)
+    raise AssertionError  # the third round returns or refuses
+
+
+def weightless(path: Path, spec: Any) -> Any:
+    """MuJoCo's model, in which bodies may move that weigh nothing; none is joined to another."""
+    compiler, tenth = spec.compiler, 0.1 * NOTHING
+    before = compiler.boundmass, compiler.boundinertia, compiler.fusestatic
+    compiler.boundmass, compiler.boundinertia = (max(bound, tenth) for bound in before[:2])
+    compiler.fusestatic = False
+    model = compiled(path, spec)
+    compiler.boundmass, compiler.boundinertia, compiler.fusestatic = before
+    return model
+
+
+NOTHING = 1e-13
+"""Mass [kg] and inertia [kg m^2] that count as none: a hundred times the least that MuJoCo's compiler accepts."""
 
 
 def written(spec: Any, home: Path | None = None) -> str:
@@ -72,7 +107,10 @@ def written(spec: Any, home: Path | None = None) -> str:
     if any(asset.file for asset in (*spec.meshes, *spec.textures, *spec.hfields, *spec.skins)):
         spec.meshdir, spec.texturedir = (_place(spec, part, home) for part in (spec.meshdir, spec.texturedir))
         spec.modelfiledir = str(home or "")
-    ctypes.CDLL(mujoco()._specs.__file__)._mjPRIVATE__set_xml_precision(DIGITS)
+    # MuJoCo has no setting for it; a release without this one writes its six digits
+    set_digits = getattr(ctypes.CDLL(mujoco()._specs.__file__), "_mjPRIVATE__set_xml_precision", None)
+    if set_digits is not None:
+        set_digits(DIGITS)
     return spec.to_xml()
 
 
@@ -100,44 +138,11 @@ def _without_meshes(path: Path, spec: Any) -> None:
         spec.delete(asset)
 
 
-def _plain(error: Exception) -> str:
-    return " ".join(str(error).split())
-
-
-def _in_included(path: Path, message: str) -> str:
-    """A message of the parser with the line of the included file that it is about; MuJoCo counts no lines there."""
-    if not message.endswith(", line 0"):
-        return message
-    for inner in included(path, path.parent):
-        try:
-            mujoco().MjSpec.from_file(str(inner))
-        except ValueError as error:
-            within, line = _plain(error).rsplit(", line ", 1)
-            if within == message.removesuffix(", line 0"):
-                return f"{within}, line {line} of {inner.relative_to(path.parent)}"
-    return message.removesuffix(", line 0")
-
-
-def _in_file(path: Path, message: str) -> str:
-    """A message of the compiler with the line of the element that it names."""
-    named = re.search(r"Element name '([^']+)'", message)
-    at = located(path, named[1]) if named else ""
-    return re.sub(r", line -?\d+", "", message).replace(named[0], f"{named[0]}, {at}") if named and at else message
-
-
-def _refuse(path: Path, message: str) -> NoReturn:
-    """Raise MachineError with the message of the compiler and the remedy of the commonest errors."""
-    hints = {
-        r"mass and inertia of moving bodies": "give every body that moves an <inertial> with mass and inertia above 0",
-        r"must satisfy A \+ B >= C": "an inertia's largest part is at most the sum of the other two: correct it",
-        r"inertia.*(positive|negative)|(positive|negative).*inertia": "masses and inertias are above 0: correct it",
-        r"repeated name|already|duplicate": "give every body, joint, motor and sensor a name of its own",
-        r"Element 'include'": "put the included file where the main file looks for it",
-        r"opening file|not found": "put the file where it is looked for, or give its body an <inertial>",
-        r"cycl|loop|parent": "a machine here is a tree: every link has one parent",
-    }
-    matching = (hint for pattern, hint in hints.items() if re.search(pattern, message, re.I))
-    hint = next(matching, "correct the file; MuJoCo's viewer shows the same error")
+def _refuse(path: Path, error: Exception) -> NoReturn:
+    """Raise MachineError with the message of MuJoCo, which has a line where it reads the file."""
+    message = re.sub(r", line (-1|0)\b", "", " ".join(str(error).split()))
+    hint = "correct the file: bodies form a tree on a fixed base, each that moves has mass and inertia above 0, "
+    hint += "the largest part of an inertia is at most the sum of the others, and names are different"
     refuse(path, f"MuJoCo's compiler refuses it: {message}", hint)
 
 

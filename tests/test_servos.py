@@ -12,22 +12,21 @@ import pytest
 from helpers import PENDULUM, rig_text, servo_model, written_again
 
 from nnap_em.data.dataset import Dataset
-from nnap_em.data.logs import Logs
+from nnap_em.data.logs import OTHER_UNIT, DataError, read_logs
 from nnap_em.data.rig import Declared, Rig, RigError, read_rig
 from nnap_em.data.servo import KINDS
 from nnap_em.diagnosis.columns import candidate_columns, tracks
 from nnap_em.effects import Candidate
 from nnap_em.effects.actuator import DeadZone, InputDelay, MotorGain, Saturation
-from nnap_em.em.build import build, build_system, measure_scales
-from nnap_em.em.servos import build_servos
+from nnap_em.em.servos import build_servos, steps_of_sample, torque_along
 from nnap_em.export.model import ExportError, write_model
-from nnap_em.fit.check import ERROR, OK, WARNING, check, drives
+from nnap_em.fit.check import ERROR, OK, WARNING, drives
 from nnap_em.fit.identifiability import identifiability, sentences
-from nnap_em.fit.identify import identify, parameter_table
+from nnap_em.fit.identify import begin, identify, parameter_table
 from nnap_em.fit.predict import horizon_errors, predict
 from nnap_em.fit.store import load, save
-from nnap_em.model.servo import LAWS, Servo
-from nnap_em.model.state_space import with_effects
+from nnap_em.model.servo import LAWS
+from nnap_em.model.state_space import MOST_STEPS, with_effects
 from nnap_em.numerics.gaussian import Gaussian
 from nnap_em.systems import specs
 
@@ -86,24 +85,25 @@ def _drives(models, x, u) -> list[np.ndarray]:
     return jax.jit(lambda x, u: [one(x, u) for one in each])(jnp.asarray(x), jnp.asarray(u))
 
 
-@pytest.mark.parametrize("name", ACTUATORS)
-def test_a_servo_of_a_file_gives_the_force_of_mujoco(tmp_path, name):
-    more = 'actuatorfrcrange="-15 15"' if name == "limited at its joint" else ""
-    rig = _of_file(tmp_path, ACTUATORS[name], more=more)
-    compiled, rng = mujoco.MjModel.from_xml_path(str(tmp_path / "machine.xml")), np.random.default_rng(0)
-    data, truth = mujoco.MjData(compiled), []
+def test_servos_of_files_give_the_force_of_mujoco(tmp_path):
+    rng, rigs, truths = np.random.default_rng(0), [], []
     x, u = rng.uniform(-2.0, 2.0, (12, 4)), rng.uniform(0.0, 3.0, (12, 1))
-    for state, push in zip(x, u, strict=True):
-        data.qpos[:], data.qvel[:] = np.split(state, 2)
-        data.ctrl[:] = push
-        mujoco.mj_forward(compiled, data)
-        truth.append(data.qfrc_actuator.copy())
-    np.testing.assert_allclose(_drives([servo_model(rig)], x, u)[0], truth, atol=1e-10)
-    assert rig.input_kinds == (name if name in KINDS else "velocity" if "at its joint" in name else rig.input_kinds[0],)
-    assert len(set(np.round(np.abs(truth).max(axis=1), 9))) > 1
-
-
-def test_every_kind_has_a_law():
+    for name, actuator in ACTUATORS.items():
+        more = 'actuatorfrcrange="-15 15"' if name == "limited at its joint" else ""
+        rigs.append(_of_file(tmp_path, actuator, more=more))
+        compiled, truth = mujoco.MjModel.from_xml_path(str(tmp_path / "machine.xml")), []
+        data = mujoco.MjData(compiled)
+        for state, push in zip(x, u, strict=True):
+            data.qpos[:], data.qvel[:] = np.split(state, 2)
+            data.ctrl[:] = push
+            mujoco.mj_forward(compiled, data)
+            truth.append(data.qfrc_actuator.copy())
+        truths.append(truth)
+    for name, own, truth in zip(ACTUATORS, _drives([servo_model(rig) for rig in rigs], x, u), truths, strict=True):
+        np.testing.assert_allclose(own, truth, atol=1e-10, err_msg=name)
+        assert len(set(np.round(np.abs(truth).max(axis=1), 9))) > 1
+    kinds = [rig.input_kinds[0] for rig in rigs]
+    assert kinds == [*KINDS][1:3] + ["damper", "affine"] + 3 * ["position"] + ["velocity", "position", "position"]
     assert set(LAWS) == set(KINDS)
 
 
@@ -253,14 +253,15 @@ def test_a_motor_of_a_file_may_be_declared_a_servo_of_its_joint(tmp_path):
     assert build_system(_of_file(tmp_path, motor)).gears == (50.0,)
 
 
+KP = "kp = { mean = 3.0, std = 1.0, at = { gain = 200.0, supply = 7.4 } }"
+LIMIT = "limit = { mean = 0.6, std = 0.0, at = { supply = 7.4 } }"
+SERVO = 'kind = "position"\n'
 BAD_LINES = {
-    "no gain": ('kind = "position"', r"\[input\] kp: missing: the input 'goal' of kind 'position' needs its kp; write"),
+    "no gain": (SERVO, r"\[input\] kp: missing: the input 'goal' of kind 'position' needs its kp; write"),
     "no kind": ("kp = 3.0", r"\[input\] kp: no input has a kp \(kinds: torque\); write kind = \"position\""),
     "unknown kind": ('kind = "positon"\nkp = 3.0', "'positon'; did you mean 'position'"),
-    "a kind that is no text": ("kind = 3", 'found 3; write kind = "position"'),
-    "negative gain": ('kind = "position"\nkp = -3.0', r"found -3; write a number above 0 \[N m/rad\]"),
-    "no torque": ('kind = "position"\nkp = 3.0\nlimit = 0.0', r"limit: found 0; write a number above 0 \[N m\]"),
-    "early": ('kind = "position"\nkp = 3.0\ndelay = -0.01', r"delay: found -0.01; write 0 or more \[s\]"),
+    "negative gain": (f"{SERVO}kp = -3.0", r"found -3; write a number above 0 \[N m/rad\]"),
+    "early": (f"{SERVO}kp = 3.0\ndelay = -0.01", r"delay: found -0.01; write 0 or more \[s\]"),
     "of another kind": (
         '[input.goal]\nkind = "velocity"\nkp = 3.0',
         r"\[input.goal\] kp: an input of kind 'velocity' has no kp; possible are kv, bias",
@@ -269,8 +270,14 @@ BAD_LINES = {
         '[input.elbow]\nkind = "position"\nkp = 3.0',
         "no input column is called 'elbow'; name it in columns and its joint in joints",
     ),
-    "misspelt": ('kind = "position"\nkp = 3.0\ndelya = 0.1', "delya: unknown table or key; did you mean 'delay'"),
-    "half a pair": ('kind = "position"\nkp = { mean = 3.0 }', r"\[input.kp\] std: missing"),
+    "half a pair": (f"{SERVO}kp = {{ mean = 3.0 }}", r"\[input.kp\] std: missing"),
+    "at no table": (SERVO + KP.partition(", at")[0] + ", at = 200.0 }", r"\[input.kp\] at: found 200.0; write at = {"),
+    "at zero": (SERVO + KP.replace("7.4", "0"), r"\[input.kp.at\] supply: found 0; write the value of that column at"),
+    "at a state": (SERVO + KP.replace("supply", "theta1"), "at: 'theta1' is the time, a state or an input; name a col"),
+    "late by a column": (
+        f"{SERVO}{KP}\ndelay = {{ mean = 0.01, std = 0.0, at = {{ gain = 1.0 }} }}", "the same in all rows; take it",
+    ),
+    "misspelt": (SERVO + KP.replace("at =", "att ="), r"\[input.kp\] att: unknown table or key; did you mean 'at'"),
 }  # fmt: skip
 
 
@@ -323,77 +330,64 @@ def test_what_scales_with_the_gain_and_what_friction_does_is_said(tmp_path):
     assert identifiability(bare, build_system(bare), build_servos(bare)) == ((), (), ())
 
 
-@pytest.mark.parametrize(
-    ("line", "marks", "said"),
-    [
-        ("kp = 12.0\nlimit = 0.2", [ERROR], "the limit is too low; write a higher one"),
-        ("kp = 12.0\nlimit = 30.0", [OK], "a position servo, limited to 30 N m"),
-        ("kp = 1.0e8", None, "stiffest servo would need .* integration steps of a sample, and gets 64"),
-    ],
-)
-def test_check_says_what_is_doubtful_about_a_servo(tmp_path, line, marks, said):
-    rig = _servo(tmp_path, f'kind = "position"\nkd = 0.4\n{line}')
-    y = 1.2 * np.sin(0.06 * np.arange(200))[None, :, None]
-    train = Logs(("a.csv",), _logs(1.1 * y, y), ("goal", "theta1"))
-    remarks = [each for each in check(rig, train, None, key=jax.random.key(0)) if each.subject == "servo"]
-    assert marks in (None, [each.mark for each in remarks])
-    ((mark, _, _),) = (each for each in remarks if re.search(said, each.text))
-    assert mark == (ERROR if marks is None else marks[0])  # the gain is one remark beside others
+REMARKS = {  # numbers of a servo whose joint needs 2 N m, 1 of them for its weight, in sequences of 2 s
+    "a limit below the weight": ("limit = 0.4", ERROR, "limited to 0.4 N m.*: the limit is too low; write a"),
+    "a limit above all": ("limit = 30.0", OK, "a position servo, limited to 30 N m"),
+    "a long delay": ("delay = 1.0", WARNING, "a delay of 1 s is much of a sequence of 2 s: write it in seconds"),
+}
 
 
-def test_a_delay_that_is_much_of_a_sequence_is_doubtful(tmp_path):
-    rig = _servo(tmp_path, 'kind = "position"\nkp = 12.0\ndelay = 1.0')
-    u, torque = np.sin(0.06 * np.arange(200))[None, :, None], np.ones(1)
-    (remark,) = drives(rig, build_system(rig), _logs(u), torque, torque)
-    assert remark.mark == WARNING
-    assert "a delay of 1 s is much of a sequence of 2 s: write it in seconds" in remark.text
+@pytest.mark.parametrize(("line", "mark", "said"), REMARKS.values(), ids=REMARKS)
+def test_check_says_what_is_doubtful_about_a_servo(tmp_path, line, mark, said):
+    rig = _servo(tmp_path, f"{SERVO}kp = 12.0\n{line}")
+    logs = _logs(np.sin(0.06 * np.arange(200))[None, :, None])
+    (remark,) = drives(rig, build_system(rig), logs, np.full(1, 2.0), np.ones(1))
+    assert remark.mark == mark and re.search(said, remark.text)
+
+
+def test_a_servo_that_no_integration_step_can_follow_is_an_error(tmp_path):
+    rig = _servo(tmp_path, f"{SERVO}kp = 1.0e8")
+    assert steps_of_sample(build_system(rig), build_servos(rig), _logs(np.ones((1, 9, 1))), 0.01) > MOST_STEPS
 
 
 # --- the fit
-
-
-KP, DELAY = 12.0, 0.017
 
 
 def _friction(v: float) -> float:
     return -(0.15 + 0.1 * np.exp(-((v / 0.4) ** 2))) * np.tanh(v / 0.05) - 0.05 * v
 
 
-def _simulated(path: Path, seed: int, sequences: int = 6, rows: int = 400, inner: int = 10) -> Dataset:
-    """Logs of MuJoCo's own position servo at a pendulum with friction, its command late by `DELAY`."""
-    actuator = f'<position name="goal" joint="a" kp="{KP}" kv=".25"/>'
+def _simulated(late: float, sequences: int = 6, rows: int = 400, inner: int = 10) -> Dataset:
+    """Logs of MuJoCo's own position servo at a pendulum with friction, its command late by so much [s]."""
+    actuator = '<actuator><position name="goal" joint="a" kp="12" kv=".25"/></actuator>'
     body = f'<worldbody><body><joint name="a" axis="0 1 0"/>{BODY}</body></worldbody>'
     option = f'<option timestep="{0.01 / inner}" integrator="RK4"/>'
-    model = mujoco.MjModel.from_xml_string(f"<mujoco>{option}{body}<actuator>{actuator}</actuator></mujoco>")
-    rng, t = np.random.default_rng(seed), 0.01 * np.arange(rows)
-    commands, readings = [], []
-    for _ in range(sequences):
-        size, period, phase = rng.uniform((0.15, 0.5, 0.0), (0.5, 3.0, 6.0), (3, 3)).T[..., None]
-        u = np.sum(size * np.sin(2 * np.pi * t / period + phase), axis=0)
-        u = u + np.repeat(rng.uniform(-0.6, 0.6, rows // 100), 100)
-        data, y = mujoco.MjData(model), []
-        data.qpos[0] = u[0]
+    model = mujoco.MjModel.from_xml_string(f"<mujoco>{option}{body}{actuator}</mujoco>")
+    rng, t, readings = np.random.default_rng(0), 0.01 * np.arange(rows), np.zeros((sequences, rows))
+    size, period, phase = rng.uniform((0.15, 0.5, 0.0), (0.5, 3.0, 6.0), (sequences, 3, 3)).T[..., None]
+    u = np.sum(size * np.sin(2 * np.pi * t / period + phase), axis=0)
+    u = u + np.repeat(rng.uniform(-0.6, 0.6, (sequences, rows // 100)), 100, axis=1)
+    for command, y in zip(u, readings, strict=True):
+        data = mujoco.MjData(model)
+        data.qpos[0] = command[0]
         for k in range(rows):
-            y.append(data.qpos[0] + 0.001 * rng.normal())
+            y[k] = data.qpos[0] + 0.001 * rng.normal()
             for j in range(inner):
-                data.ctrl[0] = u[max(0, int(np.floor(k + (j + 1e-6) / inner - DELAY / 0.01)))]
+                data.ctrl[0] = command[max(0, int(np.floor(k + (j + 1e-6) / inner - late / 0.01)))]
                 data.qfrc_applied[0] = _friction(data.qvel[0])
                 mujoco.mj_step(model, data)
-        commands.append(u)
-        readings.append(y)
-    return _logs(np.asarray(commands)[..., None], np.asarray(readings)[..., None])
+    return _logs(u[..., None], readings[..., None])
 
 
-@pytest.mark.slow  # fast: test_a_servo_of_a_file_gives_the_force_of_mujoco
+@pytest.mark.slow  # fast: test_servos_of_files_give_the_force_of_mujoco
 def test_gain_delay_and_friction_of_mujocos_servo_are_found_and_stored(tmp_path):
     """Within 5 % and 1 ms, friction to 0.08 of its size; it predicts, is stored as it is, and is not exported."""
-    lines = 'kind = "position"\nkp = { mean = 9.0, std = 4.0 }\nkd = 0.25\ndelay = { mean = 0.01, std = 0.01 }'
-    rig = _servo(tmp_path, lines)
-    data = _simulated(tmp_path, 0)
-    fit = identify(rig, data, key=jax.random.key(0), epochs=12)
+    lines = f"{SERVO}kp = {{ mean = 9.0, std = 4.0 }}\nkd = 0.25\ndelay = {{ mean = 0.01, std = 0.01 }}"
+    data = _simulated(0.017)
+    fit = identify(_servo(tmp_path, lines), data, key=jax.random.key(0), epochs=12)
     table = parameter_table(fit)
-    assert abs(table["goal.kp"][0] / KP - 1) < 0.05
-    assert abs(table["goal.delay"][0] - DELAY) < 1e-3
+    assert abs(table["goal.kp"][0] / 12.0 - 1) < 0.05
+    assert abs(table["goal.delay"][0] - 0.017) < 1e-3
     v = np.linspace(-3.0, 3.0, 61)
     curve = np.asarray(jax.vmap(fit.model.unknown)(jnp.asarray(v[:, None])))[:, 0]
     assert np.linalg.norm(curve - _friction(v)) < 0.08 * np.linalg.norm(_friction(v))
@@ -402,7 +396,7 @@ def test_gain_delay_and_friction_of_mujocos_servo_are_found_and_stored(tmp_path)
     assert max(ahead["theta1"]) < 5e-3  # of a swing of 1 rad; the noise of the readings is 0.001
     save(tmp_path / "model.npz", fit)
     again = load(tmp_path / "model.npz")
-    assert parameter_table(again) == table and again.rig == rig
+    assert parameter_table(again) == table and again.rig == fit.rig
     with pytest.raises(ExportError, match="its inputs are commands of servos"):
         write_model(again, tmp_path / "out")
 
@@ -420,7 +414,116 @@ def test_the_size_of_a_torque_that_nobody_logs_is_that_of_the_servo(tmp_path):
     np.testing.assert_allclose(size, [wanted, 0.0], rtol=5e-3)
 
 
-def test_a_servo_with_other_numbers_keeps_its_own():
-    servo = Servo("goal", "position", {"kp": jnp.asarray(1.0), "kd": jnp.asarray(2.0)})
-    other = servo.with_values({"goal.kp": jnp.asarray(3.0), "elbow.kd": jnp.asarray(4.0)})
-    assert (float(other.values["kp"]), float(other.values["kd"])) == (3.0, 2.0)
+# --- numbers that are proportional to columns of the logs
+
+GAIN, SUPPLY = 400.0, 5.5
+
+
+def _log(path: Path, gain: float | str = GAIN, supply: float | str = SUPPLY, at: int = 0, names: str = "") -> Path:
+    """A folder with one log; `at` is the row in which the columns are as given, all others hold the defaults."""
+    lines = [names or "time,goal,gain,supply,theta1"]
+    for k in range(40):
+        row = (gain, supply) if k == at or at == 0 else (GAIN, SUPPLY)
+        lines.append(f"{0.01 * k:.12g},{np.sin(0.3 * k):.9g},{row[0]},{row[1]},{0.4 * np.sin(0.3 * k - 0.5):.9g}")
+    (path / "train").mkdir(exist_ok=True)
+    (path / "train" / "a.csv").write_text("\n".join(lines) + "\n")
+    return path / "train"
+
+
+def _declared(path: Path, lines: str):
+    rig = _servo(path, SERVO + lines)
+    return servo_model(rig), read_logs(_log(path), rig).data
+
+
+def _first(data):
+    return jax.tree.map(lambda a: jnp.asarray(a[0]), data)
+
+
+def test_numbers_are_proportional_to_their_columns(tmp_path):
+    model, data = _declared(tmp_path, f"{KP}\n{LIMIT}\nkd = 0.25")
+    x = np.random.default_rng(0).uniform(-1.0, 1.0, (40, 2))
+    kp, limit = 3.0 * GAIN / 200.0 * SUPPLY / 7.4, 0.6 * SUPPLY / 7.4
+    drive = jax.jit(lambda x, seq: jax.vmap(lambda x, u: model.scene(x, u).drive[0])(x, model.inputs(seq)))
+    torque = kp * (data.u[0, :, 0] - x[:, 0]) - 0.25 * x[:, 1]
+    np.testing.assert_allclose(drive(x, _first(data)), np.clip(torque, -limit, limit), rtol=1e-12)
+    assert 0 < np.sum(np.abs(torque) > limit) < 40
+
+
+def test_declared_elsewhere_a_number_gives_the_same_motion(tmp_path):
+    """Twice the number at twice the value is the same servo; so is a plain number where columns never change."""
+    once = _declared(tmp_path, f"{KP}\n{LIMIT}")
+    twice = _declared(tmp_path, KP.replace("3.0", "6.0").replace("200.0", "400.0") + f"\n{LIMIT}")
+    plain = _declared(tmp_path, f"kp = {3.0 * GAIN / 200.0 * SUPPLY / 7.4!r}\nlimit = {0.6 * SUPPLY / 7.4!r}")
+    x = jnp.asarray([0.2, -0.4])
+
+    def moved(model, seq):
+        u = jax.tree.map(lambda a: a[5], model.inputs(seq))
+        along = model.driving((), x[None], jax.tree.map(lambda a: a[None], u))
+        return model.transition(x, u), along[0], model.scene(x, u).drive
+
+    every = jax.jit(lambda: [moved(model, _first(data)) for model, data in (once, twice, plain)])()
+    ends, along, drives = zip(*every, strict=True)
+    np.testing.assert_allclose(along, drives, rtol=1e-12)
+    assert plain[1].u.shape[-1] == 1
+    np.testing.assert_allclose(ends[1], ends[0], rtol=1e-12)
+    np.testing.assert_allclose(ends[2], ends[0], rtol=1e-9)
+
+
+def test_scales_of_the_fit_are_those_of_the_gains_in_the_logs(tmp_path):
+    """The size of the torque and the step of integration, against those of plain numbers."""
+    rig = _servo(tmp_path, SERVO + KP)
+    data = read_logs(_log(tmp_path), rig).data
+    plain = _servo(tmp_path, SERVO + f"kp = {3.0 * GAIN / 200.0 * SUPPLY / 7.4!r}")
+    bare, system = data._replace(u=data.u[..., :1]), build_system(rig)
+    steps = [steps_of_sample(system, build_servos(r), d, 0.01) for r, d in ((rig, data), (plain, bare))]
+    np.testing.assert_allclose(*steps, rtol=1e-12)
+    one, two = (
+        torque_along(build_servos(r)[0], d.u[..., 0], d.y[..., 0], d.u[..., 1:], 0.01)
+        for r, d in ((rig, data), (plain, bare))
+    )
+    np.testing.assert_allclose(one, two, rtol=1e-12)
+    assert identifiability(rig, system, build_servos(rig)) == ((), (), ())
+
+
+def test_a_declaration_is_written_and_stored_as_it_is(tmp_path):
+    rig = _servo(tmp_path, SERVO + f"{KP}\n{LIMIT}")
+    fit = begin(rig, read_logs(_log(tmp_path), rig).data, key=jax.random.key(0))
+    assert rig.input_scales == {"goal.kp": {"gain": 200.0, "supply": 7.4}, "goal.limit": {"supply": 7.4}}
+    assert (rig.scale_columns, rig.logged_inputs) == (("gain", "supply"), ("goal", "gain", "supply"))
+    assert rig.parameters["goal.kp"] == Declared(3.0, 1.0)
+    assert "goal.kp by gain and supply" in str(rig)
+    assert written_again(rig, tmp_path) == rig
+    own = _servo(tmp_path, f"{SERVO}{KP}\n[input.goal]\nkp = 2.0")
+    assert (own.input_scales, own.parameters["goal.kp"]) == ({}, Declared(2.0, 0.0))
+    save(tmp_path / "model.npz", fit)
+    again = load(tmp_path / "model.npz")
+    assert again.rig == rig
+    assert again.state.model.servos[0].scales == fit.state.model.servos[0].scales != ()
+
+
+BAD_LOGS = {
+    "negative": (
+        {"gain": -1.0, "at": 6},
+        r"line 8, column 'gain': found -1; goal.kp is proportional to it: write 0",
+    ),
+    "millivolts": ({"supply": 7400.0}, r"column 'supply': at most 7400, where rig.toml declares goal.kp at 7.4; write"),
+    "text": ({"gain": "high", "at": 3}, r"line 5, column 'gain'"),
+    "no column": ({"names": "time,goal,gain,voltage,theta1"}, "'supply'"),
+}
+
+
+@pytest.mark.parametrize("wrong, message", BAD_LOGS.values(), ids=BAD_LOGS)
+def test_a_mistake_in_a_log_is_refused_with_row_and_column(tmp_path, wrong, message):
+    rig = _servo(tmp_path, SERVO + KP)
+    with pytest.raises(DataError, match=message) as error:
+        read_logs(_log(tmp_path, **wrong), rig)
+    assert "a.csv" in str(error.value)
+
+
+@pytest.mark.parametrize("ratio", [OTHER_UNIT, 1 / OTHER_UNIT])
+def test_a_column_may_be_far_from_its_declared_value_but_not_in_another_unit(tmp_path, ratio):
+    """One percent to either side of the largest and the smallest ratio."""
+    rig, more = _servo(tmp_path, SERVO + KP), 1.01 if ratio > 1 else 1 / 1.01
+    assert read_logs(_log(tmp_path, supply=7.4 * ratio / more), rig).data.u.shape[-1] == 3
+    with pytest.raises(DataError, match="write both in one unit"):
+        read_logs(_log(tmp_path, supply=7.4 * ratio * more), rig)

@@ -18,6 +18,7 @@ from nnap_em.data.servo import KINDS
 from nnap_em.diagnosis.columns import candidate_columns, tracks
 from nnap_em.effects import Candidate
 from nnap_em.effects.actuator import DeadZone, InputDelay, MotorGain, Saturation
+from nnap_em.em.build import build, build_system, measure_scales
 from nnap_em.em.servos import build_servos, steps_of_sample, torque_along
 from nnap_em.export.model import ExportError, write_model
 from nnap_em.fit.check import ERROR, OK, WARNING, drives

@@ -22,7 +22,6 @@ from nnap_em.fit.identifiability import identifiability, sentences
 from nnap_em.init.from_machine import draft_machine
 from nnap_em.machines.mjcf import read_machine
 from nnap_em.machines.spec import in_comment
-from nnap_em.model.simulate import examples
 from nnap_em.numerics.gaussian import spd_solve
 from nnap_em.systems import specs
 from nnap_em.systems.bodies import physical
@@ -123,14 +122,6 @@ def test_drive_is_that_of_mujocos_motors(tmp_path):
     data.ctrl[:] = u = np.array([0.3, -0.2, 0.7])
     mujoco.mj_forward(model, data)
     np.testing.assert_allclose(system.drive(jnp.asarray(u)), data.qfrc_actuator, atol=1e-14)
-
-
-def test_acrobot_of_the_file_is_the_built_in_one():
-    parsed, built = tree(ROOT / "examples" / "machines" / "acrobot.xml"), examples["acrobot"]().model.system
-    x = np.array([[[0.7, -1.9], [2.0, 5.0]]])
-    (mass, bias), (other, truth) = (_each(_mass_and_bias(system), x) for system in (parsed, built))
-    np.testing.assert_allclose(mass, other, rtol=1e-13)
-    np.testing.assert_allclose(bias, truth, rtol=1e-12)
 
 
 # --- rig.toml

@@ -23,8 +23,7 @@ from nnap_em.em.servos import build_servos, steps_of_sample, torque_along
 from nnap_em.export.model import ExportError, write_model
 from nnap_em.fit.check import ERROR, OK, WARNING, drives
 from nnap_em.fit.identifiability import identifiability, sentences
-from nnap_em.fit.identify import begin, identify, parameter_table
-from nnap_em.fit.predict import horizon_errors, predict
+from nnap_em.fit.identify import begin
 from nnap_em.fit.store import load, save
 from nnap_em.model.servo import LAWS
 from nnap_em.model.state_space import MOST_STEPS, with_effects
@@ -244,10 +243,7 @@ def test_a_file_gives_what_rig_toml_leaves_out(tmp_path):
     }
     rail = _of_file(tmp_path, ACTUATORS["position on a slide"])
     assert (rail.unit("goal.kp"), rail.unit("goal.kd")) == ("N/m", "N s/m")
-
-
-def test_a_motor_of_a_file_may_be_declared_a_servo_of_its_joint(tmp_path):
-    motor = '<motor name="goal" joint="a" gear="50"/>'
+    motor = '<motor name="goal" joint="a" gear="50"/>'  # it may be declared a servo of its joint
     rig = _of_file(tmp_path, motor, '[input]\nkind = "position"\nkp = 5.0')
     assert (rig.kinds, build_system(rig).gears) == ({"goal": "position"}, (1.0,))
     assert written_again(rig, tmp_path) == rig
@@ -351,57 +347,6 @@ def test_a_servo_that_no_integration_step_can_follow_is_an_error(tmp_path):
     assert steps_of_sample(build_system(rig), build_servos(rig), _logs(np.ones((1, 9, 1))), 0.01) > MOST_STEPS
 
 
-# --- the fit
-
-
-def _friction(v: float) -> float:
-    return -(0.15 + 0.1 * np.exp(-((v / 0.4) ** 2))) * np.tanh(v / 0.05) - 0.05 * v
-
-
-def _simulated(late: float, sequences: int = 6, rows: int = 400, inner: int = 10) -> Dataset:
-    """Logs of MuJoCo's own position servo at a pendulum with friction, its command late by so much [s]."""
-    actuator = '<actuator><position name="goal" joint="a" kp="12" kv=".25"/></actuator>'
-    body = f'<worldbody><body><joint name="a" axis="0 1 0"/>{BODY}</body></worldbody>'
-    option = f'<option timestep="{0.01 / inner}" integrator="RK4"/>'
-    model = mujoco.MjModel.from_xml_string(f"<mujoco>{option}{body}{actuator}</mujoco>")
-    rng, t, readings = np.random.default_rng(0), 0.01 * np.arange(rows), np.zeros((sequences, rows))
-    size, period, phase = rng.uniform((0.15, 0.5, 0.0), (0.5, 3.0, 6.0), (sequences, 3, 3)).T[..., None]
-    u = np.sum(size * np.sin(2 * np.pi * t / period + phase), axis=0)
-    u = u + np.repeat(rng.uniform(-0.6, 0.6, (sequences, rows // 100)), 100, axis=1)
-    for command, y in zip(u, readings, strict=True):
-        data = mujoco.MjData(model)
-        data.qpos[0] = command[0]
-        for k in range(rows):
-            y[k] = data.qpos[0] + 0.001 * rng.normal()
-            for j in range(inner):
-                data.ctrl[0] = command[max(0, int(np.floor(k + (j + 1e-6) / inner - late / 0.01)))]
-                data.qfrc_applied[0] = _friction(data.qvel[0])
-                mujoco.mj_step(model, data)
-    return _logs(u[..., None], readings[..., None])
-
-
-@pytest.mark.slow  # fast: test_servos_of_files_give_the_force_of_mujoco
-def test_gain_delay_and_friction_of_mujocos_servo_are_found_and_stored(tmp_path):
-    """Within 5 % and 1 ms, friction to 0.08 of its size; it predicts, is stored as it is, and is not exported."""
-    lines = f"{SERVO}kp = {{ mean = 9.0, std = 4.0 }}\nkd = 0.25\ndelay = {{ mean = 0.01, std = 0.01 }}"
-    data = _simulated(0.017)
-    fit = identify(_servo(tmp_path, lines), data, key=jax.random.key(0), epochs=12)
-    table = parameter_table(fit)
-    assert abs(table["goal.kp"][0] / 12.0 - 1) < 0.05
-    assert abs(table["goal.delay"][0] - 0.017) < 1e-3
-    v = np.linspace(-3.0, 3.0, 61)
-    curve = np.asarray(jax.vmap(fit.model.unknown)(jnp.asarray(v[:, None])))[:, 0]
-    assert np.linalg.norm(curve - _friction(v)) < 0.08 * np.linalg.norm(_friction(v))
-    part = jax.tree.map(lambda a: a[:2], data)
-    ahead = horizon_errors(predict(fit, part, 1.0, key=jax.random.key(1), samples=20), fit, part, 1.0, (1.0, 3.0))
-    assert max(ahead["theta1"]) < 5e-3  # of a swing of 1 rad; the noise of the readings is 0.001
-    save(tmp_path / "model.npz", fit)
-    again = load(tmp_path / "model.npz")
-    assert parameter_table(again) == table and again.rig == fit.rig
-    with pytest.raises(ExportError, match="its inputs are commands of servos"):
-        write_model(again, tmp_path / "out")
-
-
 def test_the_size_of_a_torque_that_nobody_logs_is_that_of_the_servo(tmp_path):
     """RMS of kp (u - q) - kd v along a sine, behind a gear; differences over 5 rows to each side shrink it by 0.3 %."""
     t, w = 0.01 * np.arange(629), 2.0
@@ -441,33 +386,20 @@ def _first(data):
 
 
 def test_numbers_are_proportional_to_their_columns(tmp_path):
-    model, data = _declared(tmp_path, f"{KP}\n{LIMIT}\nkd = 0.25")
+    """Twice the number at twice the value is the same servo, along states and at each."""
+    once = _declared(tmp_path, f"{KP}\n{LIMIT}\nkd = 0.25")
+    twice = _declared(tmp_path, KP.replace("3.0", "6.0").replace("200.0", "400.0") + f"\n{LIMIT}\nkd = 0.25")
     x = np.random.default_rng(0).uniform(-1.0, 1.0, (40, 2))
     kp, limit = 3.0 * GAIN / 200.0 * SUPPLY / 7.4, 0.6 * SUPPLY / 7.4
-    drive = jax.jit(lambda x, seq: jax.vmap(lambda x, u: model.scene(x, u).drive[0])(x, model.inputs(seq)))
-    torque = kp * (data.u[0, :, 0] - x[:, 0]) - 0.25 * x[:, 1]
-    np.testing.assert_allclose(drive(x, _first(data)), np.clip(torque, -limit, limit), rtol=1e-12)
+    torque = kp * (once[1].u[0, :, 0] - x[:, 0]) - 0.25 * x[:, 1]
+
+    def drives(model, seq):
+        u = model.inputs(seq)
+        return jax.vmap(lambda x, u: model.scene(x, u).drive)(x, u), model.driving((), x, u)
+
+    for drive in jax.tree.leaves(jax.jit(lambda x: [drives(model, _first(d)) for model, d in (once, twice)])(x)):
+        np.testing.assert_allclose(drive[:, 0], np.clip(torque, -limit, limit), rtol=1e-12)
     assert 0 < np.sum(np.abs(torque) > limit) < 40
-
-
-def test_declared_elsewhere_a_number_gives_the_same_motion(tmp_path):
-    """Twice the number at twice the value is the same servo; so is a plain number where columns never change."""
-    once = _declared(tmp_path, f"{KP}\n{LIMIT}")
-    twice = _declared(tmp_path, KP.replace("3.0", "6.0").replace("200.0", "400.0") + f"\n{LIMIT}")
-    plain = _declared(tmp_path, f"kp = {3.0 * GAIN / 200.0 * SUPPLY / 7.4!r}\nlimit = {0.6 * SUPPLY / 7.4!r}")
-    x = jnp.asarray([0.2, -0.4])
-
-    def moved(model, seq):
-        u = jax.tree.map(lambda a: a[5], model.inputs(seq))
-        along = model.driving((), x[None], jax.tree.map(lambda a: a[None], u))
-        return model.transition(x, u), along[0], model.scene(x, u).drive
-
-    every = jax.jit(lambda: [moved(model, _first(data)) for model, data in (once, twice, plain)])()
-    ends, along, drives = zip(*every, strict=True)
-    np.testing.assert_allclose(along, drives, rtol=1e-12)
-    assert plain[1].u.shape[-1] == 1
-    np.testing.assert_allclose(ends[1], ends[0], rtol=1e-12)
-    np.testing.assert_allclose(ends[2], ends[0], rtol=1e-9)
 
 
 def test_scales_of_the_fit_are_those_of_the_gains_in_the_logs(tmp_path):
@@ -500,6 +432,8 @@ def test_a_declaration_is_written_and_stored_as_it_is(tmp_path):
     again = load(tmp_path / "model.npz")
     assert again.rig == rig
     assert again.state.model.servos[0].scales == fit.state.model.servos[0].scales != ()
+    with pytest.raises(ExportError, match="its inputs are commands of servos"):
+        write_model(again, tmp_path / "out")
 
 
 BAD_LOGS = {

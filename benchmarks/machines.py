@@ -53,7 +53,7 @@ def tree(path: Path) -> AbstractSystem:
     """The machine in a file, all as it stands there."""
     machine = read_machine(path)
     count = len(machine.joints)
-    whole = machine._replace(states=states(machine.joints), gears=(1.0,) * count)
+    whole = machine._replace(states=states(machine), gears=(1.0,) * count)
     return systems["mjcf"].declared({}, tuple(range(1, count + 1)), packed(whole))
 
 

@@ -382,7 +382,7 @@ BAD = {  # name: file, lines of [model], and what the message says
         _one(rest="<tendon><fixed name='t'><joint joint='a' coef='1'/></fixed></tendon>"),
         "", "1 tendons; put their springs and motors on joints",
     ),
-    "two motors": (_one(rest=MOTOR * 2 + "").replace("'m'", "'n'", 1), "", r"n and m drive one joint, 'a'; name one"),
+    "two motors": (_one(rest=MOTOR * 2 + "").replace("'m'", "'n'", 1), "", r"n and m drive one joint, 'a'; let one"),
     "no actuator": (_one(rest=""), "", "no actuator; write the torque columns and their joints"),
     "missing mesh": (
         _one(HINGE + '<geom type="mesh" mesh="hull"/>', '<asset><mesh name="hull" file="hull.stl"/></asset>'),
@@ -403,7 +403,7 @@ BAD = {  # name: file, lines of [model], and what the message says
     "a name that is a rate": (
         _one(HINGE + WEIGHT + SECOND.replace('"b2"', '"da"')), "", "'da' is called as the rate of joint 'a'; rename",
     ),
-    "motor called as its joint": (_one().replace("'m'", "'a'"), "", "'a' is a state, and no torque"),
+    "motor called as its joint": (_one().replace("'m'", "'a'"), "", "'a' is the time or a state, and no torque"),
     "fluid": (_one(rest="<option density='1000'/>"), "", "bodies move in a fluid; set density and viscosity to 0"),
     "gravity compensation": (_one(more=' gravcomp="1"'), "", "body 'b' has gravcomp; log the torque"),
     "nothing moves": (_one(WEIGHT, ""), "", "it has no joint; give the bodies hinges or slides"),

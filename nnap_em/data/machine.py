@@ -1,6 +1,7 @@
 """A machine from its owner's file as plain numbers: all that the physics needs, without the file and its parser."""
 
 import json
+from collections.abc import Collection
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -182,7 +183,11 @@ def machine_unit(text: str, name: str) -> str:
     return per_joint.get(quantity) or {"mass": "kg", "com": "m"}.get(quantity.partition(".")[0], "kg m^2")
 
 
-def states(joints: tuple[Joint, ...]) -> tuple[str, ...]:
-    """Coordinates and rates as the file names the joints."""
-    names = tuple(joint.name for joint in joints)
-    return names + tuple(f"d{name}" for name in names)
+def states(machine: Machine, columns: Collection[str] = ()) -> tuple[str, ...]:
+    """Coordinates and rates by the names of the joints, or of the sensors whose columns are there."""
+    names = [joint.name for joint in machine.joints]
+    names += [f"d{name}" for name in names]
+    for sensor in machine.joint_sensors:
+        if sensor.name in columns:
+            names[sensor.joint + len(machine.joints) * sensor.rate] = sensor.name
+    return tuple(names)

@@ -8,10 +8,11 @@ import math
 import re
 import tomllib
 import warnings
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple, NoReturn
 
 from ..storage.files import replace_text
@@ -531,24 +532,47 @@ def kinds_of(drives: Mapping[str, Drive]) -> tuple[str, ...]:
 
 def _input(root: _Table, model: _Table, spec: SystemSpec) -> tuple[tuple[str, ...], tuple[int, ...], dict[str, Drive]]:
     """The input columns, the joint that each drives, and what makes torque of them."""
-    drives: dict[str, Drive] = {}
     if "input" in root.items:
-        table, key = root.table("input"), "joints"
-        table.check(("columns",), drive_keys(table))
-        columns, joints = table.distinct("columns", str), table.distinct("joints", int)
-        drives = read_drives(table, columns)
-        if len(columns) != len(joints):
-            table.refuse(key, f"found {len(joints)} joints for {len(columns)} columns")
-        for column in columns:
-            if column in ("time", *spec.states):
-                table.refuse("columns", f"{column!r} is no input", "name torque columns only, or commands of servos")
+        table, names = root.table("input"), spec.states[: spec.joints]
+        columns, joints, _ = read_columns(table, spec.states, names)
+        return columns, joints, read_drives(table, columns)
+    joint = model.value("actuated_joint")
+    if type(joint) is not int or not 1 <= joint <= spec.joints:
+        model.refuse("actuated_joint", hint=f"write actuated_joint = 1, joints count from 1 to {spec.joints}")
+    return ("u",), (joint,), {}
+
+
+def read_columns(
+    table: _Table, states: Sequence[str], names: Sequence[str], motors: Mapping[str, int] = MappingProxyType({})
+) -> tuple[tuple[str, ...], tuple[int, ...], bool]:
+    """Columns of [input], the joint of each, counted from 1, and whether they are `motors` of a machine file."""
+    table.check((), drive_keys(table))
+    columns = table.distinct("columns", str) if "columns" in table.items or not motors else tuple(motors)
+    for column in columns:
+        if column in ("time", *states):
+            hint = "name torque columns only, or commands of servos; a motor by another name than its joint's"
+            table.refuse("columns", f"{column!r} is the time or a state, and no torque or command", hint)
+        if motors and "joints" not in table.items and column not in motors:
+            hint = f"{nearest(column, list(motors))}; or say which joints the columns drive: joints = [...]"
+            table.refuse("columns", f"{column!r} is no motor of the file", hint)
+    if motored := bool(motors) and "joints" not in table.items:
+        joints = [motors[column] for column in columns]
     else:
-        table, key, columns = model, "actuated_joint", ("u",)
-        joint = model.value(key)
-        joints = (joint,) if type(joint) is int else model.refuse(key)
-    if not all(1 <= joint <= spec.joints for joint in joints):
-        table.refuse(key, hint=f"joints count from 1 to {spec.joints}")
-    return columns, joints, drives
+        value = table.value("joints")
+        given: Sequence[Any] = value if isinstance(value, list) else table.refuse("joints")
+        joints = [names.index(joint) + 1 if joint in names else joint for joint in given]
+        if len(joints) != len(columns):
+            table.refuse("joints", f"found {len(joints)} joints for {len(columns)} columns")
+        if not all(type(joint) is int and 1 <= joint <= len(names) for joint in joints):
+            table.refuse(
+                "joints", None, f"write names of joints, or numbers from 1 to {len(names)}: {', '.join(names)}"
+            )
+    for joint in joints:
+        if joints.count(joint) > 1:
+            twice = " and ".join(column for column, j in zip(columns, joints, strict=True) if j == joint)
+            hint = "let one of them drive it, and log their sum"
+            table.refuse("columns", f"{twice} drive one joint, {names[joint - 1]!r}", hint)
+    return columns, tuple(joints), motored
 
 
 def _measurement(table: _Table, spec: SystemSpec, formulas: bool) -> dict[str, Any]:

@@ -32,7 +32,7 @@ def draft_machine(path: Path, model: Path, home: Path) -> Draft:
         raise DataError(f"{path}: nothing in it is called as a joint of {model} ({names}); {hint}")
     columns |= (sensed := sensors(machine, topics))
     machine = machine._replace(sensors=tuple(sensor for sensor in machine.sensors if sensor.name in sensed))
-    machine = machine._replace(states=_called(machine, tuple(columns)))
+    machine = machine._replace(states=states(machine, columns))
     text, driving = packed(machine), {name: (at, toml_text(joint)) for name, (at, joint) in inputs.items()}
     return drafted(
         path,
@@ -45,15 +45,6 @@ def draft_machine(path: Path, model: Path, home: Path) -> Draft:
         lambda name: machine_unit(text, name),
         _driven(machine, {name: joint for name, (_, joint) in driving.items()}),
     )
-
-
-def _called(machine: Machine, columns: Sequence[str]) -> tuple[str, ...]:
-    """The states, by the sensors whose columns are there."""
-    names, dof = list(states(machine.joints)), len(machine.joints)
-    for sensor in machine.joint_sensors:
-        if sensor.name in columns:
-            names[sensor.joint + dof * sensor.rate] = sensor.name
-    return tuple(names)
 
 
 def _first(fields: Sequence[tuple[Address, str]], names: Sequence[str]) -> Address | None:

@@ -8,9 +8,8 @@ from typing import Any
 import numpy as np
 
 from ..data.machine import OF_BODY, PAIRS, SENSE_UNITS, Machine, Motor, Sensor, of_body, packed, states
-from ..data.rig import Declaration, Declared, RigWarning, SystemSpec, every, kinds_of, nearest
+from ..data.rig import Declaration, Declared, RigWarning, SystemSpec, every, kinds_of, nearest, read_columns
 from ..data.servo import TORQUE, Drive, read_drives, scaled
-from ..data.servo import keys as drive_keys
 from ..data.servo import named as drive_numbers
 from .mjcf import Part, read_file
 
@@ -89,15 +88,12 @@ def _warn_of_left_out(root: Any, machine: Machine) -> None:
 
 def _states(machine: Machine, root: Any) -> tuple[str, ...]:
     """Every joint by its name, or by that of the sensor whose column is measured."""
-    names, dof = list(states(machine.joints)), len(machine.joints)
     columns = root.table("measurement").items.get("columns")
-    for sensor in machine.joint_sensors:
-        if isinstance(columns, list) and sensor.name in columns:
-            names[sensor.joint + dof * sensor.rate] = sensor.name
-    if len(set(names)) < len(names):
-        twice = next(name for name in names if names.count(name) > 1)
-        root.table("measurement").refuse("columns", f"{twice!r} names two states", "rename the sensor in the file")
-    return tuple(names)
+    names = states(machine, columns if isinstance(columns, list) else ())
+    for name in names:
+        if names.count(name) > 1:
+            root.table("measurement").refuse("columns", f"{name!r} names two states", "rename the sensor in the file")
+    return names
 
 
 def _sensors(machine: Machine, root: Any) -> Iterator[Sensor]:
@@ -117,45 +113,12 @@ def _sensors(machine: Machine, root: Any) -> Iterator[Sensor]:
 
 def _inputs(machine: Machine, root: Any) -> tuple[tuple[str, ...], tuple[int, ...], bool]:
     """Columns, the joint that each drives, counted from 1, and whether they are the motors of the file."""
-    motors = {motor.name: motor for motor in machine.motors}
-    if not motors and "input" not in root.items:
+    if not machine.motors and "input" not in root.items:
         problem = f"{machine.file} has no actuator"
         hint = "write the torque columns and their joints, or columns = [] and joints = [] where nothing drives it"
         root.refuse("input", problem, hint)
-    table = root.table("input", absent={})
-    table.check((), drive_keys(table))
-    columns = table.distinct("columns", str) if "columns" in table.items else tuple(motors)
-    for column in columns:
-        if column in ("time", *machine.states):
-            hint = "give the motor another name than the joint's, or name torque columns and joints in [input]"
-            table.refuse("columns", f"{column!r} is a state, and no torque or command", hint)
-    if "joints" in table.items:
-        joints = tuple(_place(machine, table, joint) for joint in table.value("joints"))
-        if len(joints) != len(columns):
-            table.refuse("joints", f"found {len(joints)} joints for {len(columns)} columns")
-        motored = False
-    else:
-        for column in columns:
-            if column not in motors:
-                hint = f"{nearest(column, list(motors))}; or say which joints the columns drive: joints = [...]"
-                table.refuse("columns", f"{column!r} is no motor of {machine.file}", hint)
-        joints = tuple(motors[column].joint + 1 for column in columns)
-        motored = True
-    for joint in joints:
-        if joints.count(joint) > 1:
-            problem = f"{' and '.join(c for c, j in zip(columns, joints, strict=True) if j == joint)} drive one joint"
-            problem += f", {machine.joints[joint - 1].name!r}"
-            table.refuse("columns", problem, "name one of them in [input] columns, and log their sum")
-    return columns, joints, motored
-
-
-def _place(machine: Machine, table: Any, joint: Any) -> int:
-    names = [declared.name for declared in machine.joints]
-    if isinstance(joint, str):
-        return names.index(joint) + 1 if joint in names else table.refuse("joints", None, nearest(joint, names))
-    if not isinstance(joint, int) or not 1 <= joint <= len(names):
-        table.refuse("joints", None, f"write names of joints, or numbers from 1 to {len(names)}: {', '.join(names)}")
-    return joint
+    names, motors = [joint.name for joint in machine.joints], {one.name: one.joint + 1 for one in machine.motors}
+    return read_columns(root.table("input", absent={}), machine.states, names, motors)
 
 
 def _parameters(machine: Machine, model: Any) -> dict[str, Declared]:

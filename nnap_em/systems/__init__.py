@@ -53,7 +53,7 @@ def read_rig(path: Path | str) -> Rig:
         What is declared.
 
     Raises:
-        RigError: at the first mistake, with file, key and what to do.
+        RigError: with every mistake, a line each: file, key and what to do.
 
     Example:
         >>> nnap_em.read_rig(f"{folder}/rig.toml").measured

@@ -118,16 +118,6 @@ def _rubs(model, x):
     return model.unknown(x[len(x) // 2 :])
 
 
-def test_derivatives_of_readings_are_finite_differences(tmp_path):
-    columns, step = _columns(("hand",)), 1e-6
-    model = _model(build_system(read_rig(_rig(tmp_path, ARM, columns), specs)), columns)
-    numbers = jnp.asarray(np.append(np.random.default_rng(1).uniform(-1.0, 1.0, 6), np.zeros(3)))
-    read = lambda a: model.emission(a[:6], Inputs.held(jnp.asarray([0.3, -0.8, 0.5])), a[6:])  # noqa: E731
-    both = lambda way: (jax.jvp(read, (numbers,), (way,))[1], read(numbers + step * way) - read(numbers - step * way))  # noqa: E731
-    derivative, change = jax.jit(lambda: jax.lax.map(both, jnp.eye(9)))()
-    np.testing.assert_allclose(derivative, change / (2 * step), rtol=1e-6, atol=1e-6)
-
-
 # --- what a fit makes of them
 
 CART = """<mujoco><option gravity="0 0 -9.81"/><worldbody><body name="cart">

@@ -53,6 +53,9 @@ g = 9.81\nfriction = "unknown"
 """
 
 
+SERVO = 'kind = "position"\n'
+
+
 def _rig(path: Path, text: str, *, model: str = PENDULUM, read: tuple[str, ...] = ("theta1",)) -> Rig:
     (path / "rig.toml").write_text(rig_text(model + text, read))
     return read_rig(path / "rig.toml", specs)
@@ -150,49 +153,35 @@ def test_a_voltage_is_a_velocity_servo_of_its_own_gain(tmp_path):
     np.testing.assert_allclose(_drives([driven], x, u)[0], _drives([servo], x, u / k)[0], rtol=1e-12)
 
 
-@pytest.mark.parametrize("lines", ['kind = "position"\nkp = 3.0\nkd = 0.5', 'kind = "torque"'], ids=["servo", "torque"])
-def test_the_drive_along_states_is_that_of_the_model_with_the_laws(tmp_path, lines):
-    """Columns of candidates are its changes by each law, at the same states."""
-    laws, rng = (
-        (InputDelay.of(0.013, joint=1), Saturation.of(0.5, joint=1), MotorGain.of(-0.2, joint=1)),
-        np.random.default_rng(4),
-    )
-    data = jax.tree.map(jnp.asarray, _logs(np.repeat(rng.normal(size=(1, 6, 1)), 4, axis=1)))
-    seq, plain = jax.tree.map(lambda a: a[0], data), servo_model(_servo(tmp_path, lines))
-    mean = 0.3 * jnp.asarray(rng.normal(size=(1, 24, 2)))
-    track = tracks(plain, Gaussian(mean, jnp.zeros((1, 24, 2, 2))), jax.vmap(plain.inputs)(data))
-    force = candidate_columns(plain, [Candidate(law, (law,), law) for law in laws])(track).force[0]
+def test_the_drive_along_states_is_that_of_the_model_with_the_laws(tmp_path):
+    """Columns of candidates are its changes by each law, of a torque and of a servo beside it; the torque with its
+    laws is what it is without the servo.
+    """
+    text = '[input]\ncolumns = ["goal", "tau"]\njoints = [2, 1]\n'
+    both = servo_model(_rig(tmp_path, f"{text}[input.goal]\n{SERVO}kp = 3.0\nkd = 0.5", model=ACROBOT))
+    torques, rng = servo_model(_rig(tmp_path, text, model=ACROBOT)), np.random.default_rng(4)
+    kinds = InputDelay.of(0.013, joint=1), Saturation.of(0.5, joint=2), MotorGain.of(-0.2, joint=1)
+    laws = *kinds, *(dataclasses.replace(law, joint=3 - law.joint) for law in kinds)
+    data = jax.tree.map(jnp.asarray, _logs(np.repeat(rng.normal(size=(1, 6, 2)), 4, axis=1)))
+    seq, mean = jax.tree.map(lambda a: a[0], data), 0.3 * jnp.asarray(rng.normal(size=(1, 24, 4)))
+    track = tracks(both, Gaussian(mean, jnp.zeros((1, 24, 4, 4))), jax.vmap(both.inputs)(data))
+    force = candidate_columns(both, [Candidate(law, (law,), law) for law in laws])(track).force[0]
 
-    def drive(x, seq, effects=()):
-        whole = with_effects(plain, effects)
+    def drive(model, x, seq, effects=()):
+        whole = with_effects(model, effects)
         return jax.vmap(lambda x, u: whole.scene(x, u).drive)(x, whole.inputs(seq))
 
-    along, at, (bare, *with_law) = jax.jit(
+    along, at, alone, (bare, *with_law) = jax.jit(
         lambda x, seq: (
-            plain.driving(laws[:2], x, plain.inputs(seq)),
-            drive(x, seq, laws[:2]),
-            [drive(x, seq, effects) for effects in ((), *((law,) for law in laws))],
+            both.driving(laws[:2], x, both.inputs(seq)),
+            *(drive(model, x, seq, laws[:2]) for model in (both, torques)),
+            [drive(both, x, seq, effects) for effects in ((), *((law,) for law in laws))],
         )
     )(track.middle[0], seq)
     np.testing.assert_allclose(along, at, rtol=1e-12)
+    np.testing.assert_allclose(at[:, 0], alone[:, 0], rtol=1e-12)
     assert np.abs(force).max(axis=(1, 2)).min() > 0.1
     np.testing.assert_allclose(force, np.stack(with_law) - np.asarray(bare), atol=1e-6)
-
-
-def test_a_torque_beside_a_servo_is_as_it_was(tmp_path):
-    """Laws of the input give a torque column the same beside a servo and without one."""
-    text = '[input]\ncolumns = ["goal", "tau"]\njoints = [2, 1]\n'
-    both = _rig(tmp_path, text + '[input.goal]\nkind = "position"\nkp = 3.0', model=ACROBOT)
-    assert both.input_kinds == ("position", "torque")
-    laws = (InputDelay.of(0.013, joint=1), MotorGain.of(0.1, joint=1))
-    beside, alone = servo_model(both, laws), servo_model(_rig(tmp_path, text, model=ACROBOT), laws)
-    rng = np.random.default_rng(1)
-    seq, x = (
-        jax.tree.map(lambda a: jnp.asarray(a[0]), _logs(rng.normal(size=(1, 30, 2)))),
-        jnp.asarray(rng.normal(size=4)),
-    )
-    drive = lambda model, seq: jax.vmap(lambda u: model.scene(x, u).drive[0])(model.inputs(seq))  # noqa: E731
-    np.testing.assert_allclose(*jax.jit(lambda seq: (drive(beside, seq), drive(alone, seq)))(seq), rtol=1e-12)
 
 
 # --- what is declared
@@ -252,7 +241,6 @@ def test_a_file_gives_what_rig_toml_leaves_out(tmp_path):
 
 KP = "kp = { mean = 3.0, std = 1.0, at = { gain = 200.0, supply = 7.4 } }"
 LIMIT = "limit = { mean = 0.6, std = 0.0, at = { supply = 7.4 } }"
-SERVO = 'kind = "position"\n'
 BAD_LINES = {
     "no gain": (SERVO, r"\[input\] kp: missing: the input 'goal' of kind 'position' needs its kp; write"),
     "no kind": ("kp = 3.0", r"\[input\] kp: no input has a kp \(kinds: torque\); write kind = \"position\""),

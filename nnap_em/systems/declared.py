@@ -1,9 +1,10 @@
 """Declaration in rig.toml of a plant as equations: [model], [model.unknown] and the columns of [measurement]."""
 
 from collections.abc import Collection, Mapping
+from functools import partial
 from typing import Any
 
-from ..data.rig import Declaration, SystemSpec, nearest
+from ..data.rig import Declaration, SystemSpec, every, nearest
 from .equations import Text
 from .expression import FUNCTIONS, Formula, FormulaError, parse
 
@@ -24,7 +25,7 @@ def declare(root: Any, of: Text | None = None) -> Declaration:
     _distinct(model, states, inputs, parameters, unknown.items)
     if of is not None:
         model.check(("type", *of.parameters), ("units", "unknown"))
-    terms = {name: _term(unknown, name, states, inputs) for name in unknown.items}
+    terms = every(**{name: partial(_term, unknown, name, states, inputs) for name in unknown.items})
     named = {name: signals for name, (port, signals) in terms.items() if not port}
     known = (*states, *inputs, *parameters, *named)
     rates = {} if of is not None else _rates(model, states, known)
@@ -94,7 +95,7 @@ def _rates(model: Any, states: Collection[str], known: Collection[str]) -> dict[
     for name in states:
         if name not in rates.items:
             rates.refuse(name, "a state without rate", f'write {name} = "..." , its derivative by time [1/s]')
-    return {name: _formula(rates, name, known) for name in states}
+    return every(**{name: partial(_formula, rates, name, known) for name in states})
 
 
 def _formula(table: Any, key: str, known: Collection[str]) -> Formula:
@@ -119,13 +120,13 @@ def _readings(measurement: Any, states: Collection[str], known: Collection[str])
                 measurement.refuse("columns", f"{name!r} is no state", hint)
         return {}
     table = measurement.table("columns")
-    every = {name: _formula(table, name, known) for name in table.items}
-    for name, formula in every.items():
+    formulas = every(**{name: partial(_formula, table, name, known) for name in table.items})
+    for name, formula in formulas.items():
         if name in states and formula.text != name:
             table.refuse(
                 name, "a column with the name of a state, but another formula", "name the state or the column otherwise"
             )
-    return {name: formula for name, formula in every.items() if name not in states}
+    return {name: formula for name, formula in formulas.items() if name not in states}
 
 
 def _term(unknown: Any, name: str, states: Collection[str], inputs: Collection[str]) -> tuple[str, tuple[str, ...]]:

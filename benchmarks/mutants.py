@@ -639,8 +639,8 @@ mistakes after the first left unsaid
 + mistakes.setdefault("", error)
 ## test_rig.py::test_a_name_of_any_letters_comes_back[joint 1 [rad]]
 a bracket lost from a name
-- return name if re.fullmatch(r"[\w-]+", name, re.ASCII) else toml_text(name)
-+ return toml_text(name.strip("]"))
+- re.ASCII) else toml_text(name)
++ re.ASCII) else toml_text(name.strip("]"))
 # init/draft.py
 ## test_draft.py::test_columns_with_other_names_or_units_are_mapped[from 0]
 joints counted from 0 taken as they are

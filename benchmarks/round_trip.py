@@ -96,7 +96,7 @@ def main() -> None:
         (folder / "arm.xml").write_text(arm(6))
         own = [*(ROOT / "examples/machines").glob("*.xml"), *(ROOT / "tests/machines").iterdir(), folder / "arm.xml"]
         for path in args.file or sorted(own):
-            spec = opened(path, path.suffix == ".urdf")
+            spec = opened(path)
             before, after = compiled(path, spec), mujoco.MjModel.from_xml_path(str(through(path, folder)))
             states = np.random.default_rng(0).uniform(-3.0, 3.0, (20, 2, before.nv))
             pairs = zip(physics(before, states), physics(after, states), strict=True)

@@ -11,6 +11,11 @@ import numpy as np
 from mcap.writer import CompressionType, IndexType, Writer
 from mcap_ros2._dynamic import serialize_dynamic
 
+from nnap_em.data.rig import read_rig
+from nnap_em.import_.declared import read_plan
+from nnap_em.import_.resample import Resampled, resample
+from nnap_em.systems import specs
+
 NS = 1_000_000_000
 EPOCH = 1_700_000_000 * NS
 """Where the clocks of these logs begin [ns]."""
@@ -115,6 +120,12 @@ def write_mcap(
 
 NO_INDEX = {"index_types": IndexType.NONE, "repeat_channels": False, "repeat_schemas": False, "use_statistics": False,
             "use_summary_offsets": False}  # fmt: skip
+
+
+def imported(log: Path, rig_file: Path, shifts: Mapping[str, float] | None = None) -> Resampled:
+    """A log on the grid of a rig."""
+    rig = read_rig(rig_file, specs)
+    return resample(log, rig, read_plan(rig_file, (*rig.logged_inputs, *rig.measured)), shifts or {})
 
 
 def write_hdf5(path: Path, groups: Mapping[str, Mapping[str, Any]]) -> Path:

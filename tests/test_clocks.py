@@ -9,18 +9,15 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from helpers import pendulum_rig, read_table
-from recorders import EPOCH, JOINTS, MULTI, NS, TOPICS, arrays, joint_states, ns, ros2, write_hdf5, write_mcap
+from recorders import EPOCH, JOINTS, MULTI, NS, TOPICS, arrays, imported, joint_states, ns, ros2, write_hdf5, write_mcap
 
 from nnap_em.data import dates, formats
 from nnap_em.data.dataset import DataError
-from nnap_em.data.rig import read_rig
 from nnap_em.import_ import clock
-from nnap_em.import_.declared import read_plan
 from nnap_em.import_.files import reader
-from nnap_em.import_.resample import Resampled, resample
+from nnap_em.import_.resample import Resampled
 from nnap_em.import_.segments import covered, runs, sent_on_change
 from nnap_em.import_.signals import Signal
-from nnap_em.systems import specs
 
 DT = 0.01
 RIG = pendulum_rig() + "[import]\n"
@@ -52,9 +49,7 @@ def _mcap(path, log, stamps, command_t, command):
 def _import(path, more: str = "", shifts=None, rig: str = RIG) -> Resampled:
     rig_file = path.with_name("rig.toml")
     rig_file.write_text(rig + more + (TOPICS if path.suffix == ".mcap" else ""))
-    declared = read_rig(rig_file, specs)
-    plan = read_plan(rig_file, (*declared.logged_inputs, *declared.measured))
-    return resample(path, declared, plan, shifts or {})
+    return imported(path, rig_file, shifts)
 
 
 def _notes(log: Resampled) -> str:

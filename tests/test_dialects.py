@@ -15,7 +15,7 @@ from dialects import DT, Q, T, U, V
 from helpers import pendulum_rig
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from recorders import ns, plain_json, write_hdf5, write_mcap
+from recorders import imported, ns, plain_json, write_hdf5, write_mcap
 
 from nnap_em.commands import cli
 from nnap_em.data import formats
@@ -24,10 +24,8 @@ from nnap_em.data.logs import DataWarning, read_logs
 from nnap_em.data.rig import RigError, read_rig
 from nnap_em.import_ import table_file, text_file
 from nnap_em.import_.columns import in_unit, resolve
-from nnap_em.import_.declared import read_plan
 from nnap_em.import_.files import reader
 from nnap_em.import_.recording import Address, Topic, address, last_word, places
-from nnap_em.import_.resample import resample
 from nnap_em.init.from_machine import draft_machine
 from nnap_em.systems import specs
 
@@ -44,11 +42,8 @@ def _rig(folder, columns=()):
 
 
 def _imported(log, path):
-    """The sequences of a log, the columns in the order of the rig."""
-    rig = read_rig(path, specs)
-    plan = read_plan(path, (*rig.logged_inputs, *rig.measured))
-    values = resample(log, rig, plan, {}).values
-    return [np.stack([each[name] for name in (*rig.logged_inputs, *rig.measured)], 1) for each in values]
+    """The sequences of a log, the columns in the order of the rig: inputs first."""
+    return [np.stack([*each.values()], 1) for each in imported(log, path).values]
 
 
 def _close(tables, rows: int, atol: float, parts: int = 1, apart: int | None = None) -> None:

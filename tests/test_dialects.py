@@ -17,7 +17,6 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from recorders import imported, ns, plain_json, write_hdf5, write_mcap
 
-from nnap_em.commands import cli
 from nnap_em.data import formats
 from nnap_em.data.dataset import DataError
 from nnap_em.data.logs import DataWarning, read_logs
@@ -26,12 +25,9 @@ from nnap_em.import_ import table_file, text_file
 from nnap_em.import_.columns import in_unit, resolve
 from nnap_em.import_.files import reader
 from nnap_em.import_.recording import Address, Topic, address, last_word, places
-from nnap_em.init.from_machine import draft_machine
 from nnap_em.systems import specs
 
 RIG = pendulum_rig(dt=DT)
-ARM = """<mujoco><worldbody><body name="link"><joint name="joint0" axis="0 1 0"/>
-<inertial pos="0 0 -0.2" mass="1" diaginertia="0.01 0.01 0.001"/></body></worldbody></mujoco>"""
 
 
 def _rig(folder, columns=()):
@@ -286,27 +282,6 @@ def test_what_is_not_read_is_refused_with_the_line_that_helps(tmp_path, write, n
     assert "\n" not in str(refused.value)
 
 
-def test_a_draft_of_another_dialect_is_imported(tmp_path):
-    log = dialects.table(tmp_path / "a.csv", "t_ms;fTorque;theta1_deg;dtheta1", (1e3 * T, *DEGREES[1:]), ";", ",")
-    assert cli.main(["init", str(log), "--system", "pendulum"]) == 0
-    drafted = tmp_path / "rig.toml"
-    drafted.write_text(re.sub(r"(?m)^# (\w+) = \.\.\.", r"\1 = 0.2", drafted.read_text()))
-    assert (read_rig(drafted, specs).dt, read_rig(drafted, specs).input_columns) == (DT, ("fTorque",))
-    assert '"theta1" = { from = "theta1_deg", scale = 0.0174532925 }' in drafted.read_text()
-    (table,) = _imported(log, drafted)
-    _close([table], len(table), 2e-8)
-
-
-def test_joints_of_a_machine_are_found_in_paths(tmp_path):
-    (model := tmp_path / "arm.xml").write_text(ARM)
-    paths = f"{JOINT}/position,{JOINT}/velocity", "MAIN.joint0.ActPos [deg],MAIN.joint0.ActVelo [rad/s]"
-    for names, angle, of in ((paths[0], Q, "{}"), (paths[1], np.degrees(Q), "{{ from = {}, scale = 0.0174532925 }}")):
-        log = dialects.table(tmp_path / "a.csv", f"__time,{names}", (T, angle, V))
-        text = draft_machine(log, model, tmp_path).text
-        assert f"dt = {DT}" in text and 'columns = ["joint0", "djoint0"]' in text
-        assert '"joint0" = ' + of.format(f'"{names.split(",")[0]}"') in text
-
-
 WORDS = {  # a path, and its last word
     "q": "q", "/arm/q": "q", "arm.q[3]": "q[3]", "position[hip.left]": "position[hip.left]", "a/b [rad/s]": "b [rad/s]",
     "/joint_states/joint0/position": "position[joint0]", "Axis1.ActPos": "position[Axis1]", "pos": "pos",
@@ -375,17 +350,6 @@ def test_a_table_of_lists_without_rows_is_refused(tmp_path, rows):
     pq.write_table(pa.table({"time": pa.array([0.0] * rows, pa.float64()), "state": lists}), tmp_path / "a.parquet")
     with pytest.raises(DataError, match=rf"a\.parquet: the file: found {rows} rows?; write 2 rows or more"):
         reader(tmp_path / "a.parquet").topics(tmp_path / "a.parquet")
-
-
-def test_names_that_need_quotation_marks_come_back(tmp_path):
-    """From a table with such a header through the data set that `import` writes."""
-    names = ["time", 'u, "raw"', "theta1", "dtheta1"]
-    formats.write_csv(tmp_path / "a.csv", dict(zip(names, COLUMNS, strict=True)))
-    rig = tmp_path / "rig.toml"
-    rig.write_text(RIG.replace('["u"]', "['u, \"raw\"']"))
-    assert cli.main(["import", str(tmp_path / "a.csv"), "--rig", str(rig), "--out", str(tmp_path / "out")]) == 0
-    logs = read_logs(tmp_path / "out/train", read_rig(tmp_path / "out/rig.toml", specs))
-    np.testing.assert_allclose(logs.data.u[0, :, 0], U, atol=1e-9)
 
 
 _lines = st.lists(st.lists(st.text('0159.,;-eE\t"#NameTrueX_Value[]°', max_size=7), max_size=4), max_size=9)

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers import nnap, pendulum_rig, read_table
-from recorders import JOINTS, MULTI, TOPICS, arrays, joint_states, ns, plain_json, ros2, write_hdf5, write_mcap
+from recorders import JOINTS, MULTI, TOPICS, arrays, joint_states, ns, plain_json, ros2, write_mcap
 
 from nnap_em.data.formats import write_csv
 from nnap_em.data.logs import read_logs
@@ -214,22 +214,6 @@ def test_two_logs_are_one_data_set_each_on_a_clock_of_its_own_or_on_that_of_the_
             np.testing.assert_allclose(table[:, 2:].T, [columns["theta1"], columns["dtheta1"]], rtol=1e-11, atol=1e-8)
         assert '"/state:theta1"' in (out / "rig.toml").read_text()
         read_logs(out / "train", read_rig(out / "rig.toml", specs))
-
-
-def test_hdf5_and_csv_give_the_same_as_mcap(tmp_path):
-    t = DT * np.arange(300)
-    columns = {"theta1": _theta(t), "dtheta1": 3 * np.cos(3 * t), "u": np.cos(t)}
-    write_csv(tmp_path / "a.csv", {"time": t} | columns)
-    write_hdf5(tmp_path / "a.h5", {"arm": {"time": t} | columns})
-    _write(tmp_path / "a.mcap", t, t, np.cos(t))
-    tables = []
-    for name in ("a.csv", "a.h5", "a.mcap"):
-        rig = _rig(tmp_path / name[2:], columns=COLUMNS if name == "a.mcap" else "")
-        tables += _tables(_imported(tmp_path / name, rig, name=f"out {name}"))
-    assert len(tables) == 3
-    for table in tables:
-        np.testing.assert_allclose(table, tables[0], rtol=0, atol=1e-8)  # stamps in ns, at 9 rad/s^2
-        np.testing.assert_allclose(table[:, 1], np.cos(t), rtol=1e-11)
 
 
 def _said(old: str, new: str) -> dict[str, str]:

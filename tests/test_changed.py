@@ -7,13 +7,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import nnap
 from rigs import slide_logs, slide_rig
 
 from nnap_em import diagnose, findings, identify
 from nnap_em.data.dataset import DataError
-from nnap_em.data.formats import write_csv
-from nnap_em.data.rig import Declared, write_rig
+from nnap_em.data.rig import Declared
 from nnap_em.diagnosis.change import changes
 from nnap_em.diagnosis.outcome import Diagnosis, Step, Suspect
 from nnap_em.diagnosis.verdict import KEEP, RISEN, veto
@@ -167,19 +165,3 @@ def test_the_level_of_a_recording_is_the_log_of_its_rms_and_larger_ones_are_seen
     now, before = np.log([3.0, 2.5, 4.0, 3.5]), np.log([1.0, 1.2, 0.9, 1.1])
     assert risen(before, now).p_value == risen(before, now).least == pytest.approx(1 / math.comb(8, 4))
     assert risen(before, now).ratio == pytest.approx(math.exp(np.median(now) - np.median(before)))
-
-
-# --- the command
-
-
-def test_what_a_fit_cannot_begin_gets_one_line(tmp_path, capsys, slide_fit):
-    save(tmp_path / "model.npz", slide_fit)
-    data = slide_logs(1, sequences=1)
-    (tmp_path / "logs" / "train").mkdir(parents=True)
-    write_rig(dataclasses.replace(slide_rig(), friction=False), tmp_path / "logs" / "rig.toml")
-    log = {"time": data.t[0], "u": data.u[0, :, 0], "x": data.y[0, :, 0]}
-    write_csv(tmp_path / "logs" / "train" / "0.csv", log)
-    options = "--from", tmp_path / "model.npz", "--out", tmp_path / "out"
-    assert nnap("diagnose", tmp_path / "logs", *options) == 2
-    assert "is not that of the fit: friction is True in the fit and False here" in capsys.readouterr().err
-    assert not (tmp_path / "out").exists()

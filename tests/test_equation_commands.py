@@ -133,18 +133,14 @@ def test_fits_of_other_equations_are_not_compared(place, monkeypatch, capsys):
     assert "the equations of monday and other differ; compare fits of one machine" in capsys.readouterr().err
 
 
-def test_the_numbers_of_equations_are_exported_with_their_units(place, tmp_path):
-    fitted, _ = _fit(place / "monday_logs", LAWS[:2])
+@pytest.mark.skipif(shutil.which("gcc") is None, reason="needs gcc")
+def test_numbers_are_exported_with_units_and_compiled_rates_and_readings_are_those_of_the_library(place, tmp_path):
+    """With a law of two states and a bent reading; a law of the input is left out, which the file states."""
+    fitted, _ = _fit(place / "monday_logs", LAWS)
     write_model(fitted, tmp_path)
     document = json.loads((tmp_path / "parameters.json").read_text())
     assert document["inputs"] == [{"name": "u", "joint": None, "unit": "V"}]
-    assert [effect["channel"] for effect in document["effects"]] == ["a", "y"]
-
-
-@pytest.mark.skipif(shutil.which("gcc") is None, reason="needs gcc")
-def test_compiled_rates_and_readings_are_those_of_the_library(place, tmp_path):
-    """With a law of two states and a bent reading; a law of the input is left out, which the file states."""
-    fitted, _ = _fit(place / "monday_logs", LAWS)
+    assert [effect["channel"] for effect in document["effects"]] == ["a", "y", "u"]
     assert write_c(fitted, tmp_path / "two tanks.c") == ["dead_zone"]
     text = (tmp_path / "two tanks.c").read_text()
     assert "a [V], b [V]" in text and "Not in here: dead_zone." in text and "two_tanks_STATES" not in text

@@ -268,8 +268,9 @@ def test_a_shaped_finish_adds_the_prior_of_friction_and_nothing_to_parameters(mo
     np.testing.assert_allclose(information, weight + 7.0 * shaped * np.outer(friction, friction))
 
 
-@pytest.mark.parametrize(("apart", "slope"), [(0.0, 1.0), (0.5, 1.0), (0.5, 0.1), (2.0, 30.0)])
-@pytest.mark.parametrize("force", [0.0, 0.3])
+@pytest.mark.parametrize(
+    ("apart", "slope", "force"), [(0.0, 1.0, 0.0), (0.0, 1.0, 0.3), (0.5, 0.1, 0.0), (0.5, 1.0, 0.3), (2.0, 30.0, 0.3)]
+)
 def test_recordings_that_disagree_and_forces_unsaid_widen_a_posterior_but_not_its_prior(
     monkeypatch, apart, slope, force
 ):

@@ -21,11 +21,10 @@ from nnap_em.diagnosis.keys import completed, contains, elsewhere, key_of, remai
 from nnap_em.diagnosis.losses import MultiStep
 from nnap_em.diagnosis.outcome import Diagnosis, Step, Suspect
 from nnap_em.diagnosis.propose import seeded
-from nnap_em.diagnosis.refit import Refit
 from nnap_em.diagnosis.rounds import Round, decided
 from nnap_em.diagnosis.screen import Screened
 from nnap_em.diagnosis.smoothed import SmoothedFit
-from nnap_em.diagnosis.trial import Begun, Trial, certainty, leader
+from nnap_em.diagnosis.trial import Trial, certainty, leader
 from nnap_em.diagnosis.verdict import Share
 from nnap_em.effects import AbstractEffect, Candidate, catalogue, flat
 from nnap_em.effects.function import Axis, InputAxis
@@ -365,9 +364,11 @@ def test_a_band_shows_a_free_function_at_its_own_bar():
 
 def test_the_start_of_a_law_whose_step_removes_most_is_refitted_if_that_is_enough():
     """A start that is not physical comes last, as a cogging of another number of periods is another law."""
-    zone = lambda value: Refit(with_effects(MODEL, (_law("dead_zone", value),)), RULE, None, np.zeros(6), None)  # noqa: E731
-    begun = [Begun(_zone(0.5), BARE, zone(value), share) for value, share in ((0.8, -0.6), (0.9, 0.2), (-1.0, 0.3))]
-    assert float(leader(begun).start.model.effects[0].width) == 0.9
+    begun = []
+    for value, share in ((0.8, -0.6), (0.9, 0.2), (-1.0, 0.3)):
+        law = _law("dead_zone", value)
+        begun.append((Trial(_zone(0.5), BARE.plus(law, _candidate(law)), share, np.inf, np.inf, share), value))
+    assert leader(begun)[1] == 0.9
     # a third of what a refit must remove is 3 %; a coordinate that is not read was inferred without the law
     for share, complexity, hidden, enough in (
         (0.029, 0, False, False), (0.031, 0, False, True), (0.031, 1, False, False), (0.029, 0, True, True),

@@ -82,19 +82,9 @@ def null_of(hypothesis: Hypothesis, fit: SmoothedFit, loss: MultiStep, passes: i
     return Null(start, fitted(start, fit, loss, passes))
 
 
-class Begun(NamedTuple):
-    """A form of a law in the model, at the step of the screen."""
-
-    screened: Screened
-    full: Hypothesis
-    start: Refit
-    foreseen: float
-    """Share of the squared error that the step removes."""
-
-
-def leader(begun: Iterable[Begun]) -> Begun:
-    """The form whose step removes most; those that are not physical come last."""
-    return max(begun, key=lambda form: (form.start.model.effects[-1].is_physical(), form.foreseen))
+def leader(begun: Iterable[tuple[Trial, Refit]]) -> tuple[Trial, Refit]:
+    """The start of a law whose step removes most; those that are not physical come last."""
+    return max(begun, key=lambda each: (each[0].effect.is_physical(), each[0].foreseen))
 
 
 def with_candidate(forms: Sequence[Screened], null: Null, fit: SmoothedFit, loss: MultiStep, passes: int) -> Trial:
@@ -106,29 +96,26 @@ def with_candidate(forms: Sequence[Screened], null: Null, fit: SmoothedFit, loss
     """
     hypothesis = fit.hypothesis
 
-    def stepped(form: Screened) -> Begun:
+    def stepped(form: Screened) -> tuple[Trial, Refit]:
         effect = seeded(form.candidate, form.coefficients)
         place = replaced(effect, hypothesis.model)
         full = (hypothesis if place is None else hypothesis.without(place)).plus(effect, form.candidate)
         start = begun(full, extended(full.model, fit.path, fit.data), fit, loss)
-        return Begun(form, full, start, 1 - loss.ratio(null.start, start, fit, form.band))
+        share = 1 - loss.ratio(null.start, start, fit, form.band)
+        return Trial(form, full.refitted(start.model), share, np.inf, np.inf, share), start
 
-    screened, full, start, share = leader(map(stepped, forms))
-    candidate = screened.candidate
-    if not foreseen(share, screened.floor, complexity(candidate.start), hidden=hypothesis.model.hides):
-        return Trial(screened, full.refitted(start.model), share, np.inf, np.inf, share)
+    trial, start = leader(map(stepped, forms))
+    form = trial.screened
+    if not foreseen(trial.foreseen, form.floor, complexity(form.candidate.start), hidden=hypothesis.model.hides):
+        return trial
     end = fitted(start, fit, loss, passes)
-    after = full.refitted(end.model)
-    effect, cov = after.model.effects[-1], covariances(after.model, after.m_step, end.hessian)[-1]
-    reported = estimates(effect, cov, after.model.system).get("amplitude")
-    return Trial(
-        screened,
-        after,
-        1 - loss.ratio(null.end, end, fit, screened.band),
-        certainty(candidate, effect, cov),
-        reported.value / reported.std if reported and reported.std > 0 else np.inf,
-        share,
-        end,
+    trial = trial._replace(after=trial.after.refitted(end.model), refit=end)
+    effect, cov = trial.effect, covariances(trial.after.model, trial.after.m_step, end.hessian)[-1]
+    reported = estimates(effect, cov, trial.after.model.system).get("amplitude")
+    return trial._replace(
+        removed=1 - loss.ratio(null.end, end, fit, form.band),
+        certainty=certainty(form.candidate, effect, cov),
+        amplitude=reported.value / reported.std if reported and reported.std > 0 else np.inf,
     )
 
 

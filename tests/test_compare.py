@@ -46,16 +46,6 @@ def changed(fits) -> Comparison:
     return compare(fits[0], str(fits[1] / "model.npz"))
 
 
-@pytest.mark.slow  # fast: test_alarms_are_as_frequent_as_the_level_says
-def test_nothing_changed_between_two_sets_of_recordings_of_a_slide(slide_fit):
-    second = identify(slide_rig(), slide_logs(1), key=jax.random.key(0))
-    unchanged = compare(slide_fit, second, names=("may", "june"))
-    assert unchanged.changed == unchanged.warnings == ()
-    assert unchanged.verdict == (
-        "None of 2 tested quantities changed between may and june beyond the stated errors (at 1%)."
-    )
-
-
 def test_friction_that_grew_is_named_and_nothing_else(changed):
     assert changed.names == ("first", "grown") and changed.changed == ("friction of joint 1",)
     assert changed.verdict == (

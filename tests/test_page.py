@@ -83,7 +83,7 @@ class _Balance(HTMLParser):
         self.open, self.addresses, self.tags, self.words = [], [], [], []
         self.feed(html)
         self.close()
-        assert self.open == [] and html.lstrip().startswith("<!DOCTYPE html>")
+        assert self.open == [] and html.startswith("<!DOCTYPE html>")
         self.text = " ".join("".join(self.words).split())
 
     def handle_starttag(self, tag, attrs):

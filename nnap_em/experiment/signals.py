@@ -7,8 +7,10 @@ from jaxtyping import Float
 
 from .limits import Limits
 
-Shape, Time = Float[np.ndarray, " shape"], Float[np.ndarray, " time"]
-"""Numbers from 0 to 1 that shape a signal, and rows of time [s] where it is between -1 and 1."""
+Shape = Float[np.ndarray, " shape"]
+"""Numbers from 0 to 1 that shape a signal."""
+Time = Float[np.ndarray, " time"]
+"""Time [s], or a signal between -1 and 1."""
 
 
 def multisine(z: Shape, t: Time) -> Time:

@@ -82,17 +82,16 @@ def _faulty(kind: str, when: int | str):
             part = path.with_name(f".{path.name}.{os.getpid()}.part")
             part.write_bytes(content[: len(content) // 2] if kind == "in a write" else content)
         elif kind in ERRORS:
+            limits = resource.getrlimit(resource.RLIMIT_FSIZE)
             with pytest.MonkeyPatch.context() as patch:
                 if kind == "full disk":
-                    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
                     resource.setrlimit(resource.RLIMIT_FSIZE, (len(content) // 2, limits[1]))
                 else:
                     patch.setattr(files.os, "replace", _denied)
                 try:
                     whole(path, content)
                 finally:
-                    if kind == "full disk":
-                        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+                    resource.setrlimit(resource.RLIMIT_FSIZE, limits)
         else:
             if kind != "Ctrl-C before a write":
                 whole(path, content)

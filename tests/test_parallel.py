@@ -76,10 +76,10 @@ def rig(tmp_path_factory) -> Path:
 
 
 @contextlib.contextmanager
-def _launched(*order: object, **options) -> Iterator[subprocess.Popen]:
-    """Processes of a command, which end at the end."""
-    options = {"env": ENVIRONMENT} | options | {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE, "text": True}
-    run = subprocess.Popen([sys.executable, "-m", "nnap_em.launch", *map(str, order)], **options)
+def _launched(*order: object, env: dict[str, str] = ENVIRONMENT, own: bool = False) -> Iterator[subprocess.Popen]:
+    """Processes of a command, which end at the end; `own`: they are a group that signals are sent to."""
+    argv, piped = [sys.executable, "-m", "nnap_em.launch", *map(str, order)], subprocess.PIPE
+    run = subprocess.Popen(argv, env=env, start_new_session=own, stdout=subprocess.DEVNULL, stderr=piped, text=True)
     try:
         yield run
     finally:
@@ -142,8 +142,8 @@ if "--work" in sys.argv:  # not in the process that starts the others
 def toy(rig, tmp_path) -> Iterator[subprocess.Popen]:
     """Two processes of it that have finished a step, whose results go to `tmp_path / "out"`."""
     (tmp_path / "sitecustomize.py").write_text(TOY)
-    place = {"env": ENVIRONMENT | {"PYTHONPATH": os.pathsep.join([str(tmp_path), ENVIRONMENT["PYTHONPATH"]])}}
-    with _launched(2, "identify", rig, "--out", tmp_path / "out", start_new_session=True, **place) as run:
+    env = ENVIRONMENT | {"PYTHONPATH": os.pathsep.join([str(tmp_path), ENVIRONMENT["PYTHONPATH"]])}
+    with _launched(2, "identify", rig, "--out", tmp_path / "out", env=env, own=True) as run:
         deadline = time.monotonic() + 300
         while not list(tmp_path.glob("out/unfinished/*.npz")):
             assert run.poll() is None and time.monotonic() < deadline

@@ -1,5 +1,6 @@
 """Public names: where they are, and that the examples of their docstrings run on one small slide."""
 
+import dataclasses
 import doctest
 import importlib
 import inspect
@@ -52,15 +53,17 @@ def test_reference_has_every_public_name():
 
 @pytest.fixture(scope="module")
 def names(tmp_path_factory, slide_fit):
-    """A slide with its logs, and a fit of it."""
+    """A slide with its logs, and two fits of it."""
     folder = tmp_path_factory.mktemp("public") / "bench"
     assert nnap("simulate", folder, "--system", "slide", "--sequences", 4, "--test", 1, "--steps", 95) == 0
     rig, key = slide_rig(), jax.random.key(0)
     logs, test = (nnap_em.read_logs(folder / part, rig) for part in ("train", "test"))
+    best = dataclasses.replace(slide_fit.state.best, log_r=slide_fit.state.best.log_r + 1.0)
+    other = slide_fit._replace(state=slide_fit.state._replace(best=best))
     diagnosis = nnap_em.Diagnosis(slide_fit, slide_fit, (), ())
     return {
         "nnap_em": nnap_em, "np": np, "jnp": jnp, "folder": str(folder), "rig": rig, "key": key, "logs": logs,
-        "train": logs.data, "test": test.data, "fit": slide_fit, "other": slide_fit, "diagnosis": diagnosis,
+        "train": logs.data, "test": test.data, "fit": slide_fit, "other": other, "diagnosis": diagnosis,
     }  # fmt: skip
 
 

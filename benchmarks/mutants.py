@@ -686,6 +686,25 @@ a machine's file written with MuJoCo's own six digits
 a held body placed along the axes of the world
 - turns[parent].T @ (places[i] - places[parent])
 + places[i] - places[parent]
+# export/unroll.py
+## test_unroll.py::test_compiled_c_has_the_numbers_of_jax[where]
+branches of a choice in C the other way round
+- ("{0} ? {2} : {1}",
++ ("{0} ? {1} : {2}",
+## test_unroll.py::test_what_c_has_not_is_refused_by_name[whole numbers divided]
+whole numbers divided as floating ones
+- if reason:
++ if False:
+# export/placement.py
+## test_played.py::test_a_law_in_the_file_accelerates_as_in_the_library[torsional_spring]
+a spring written with the other sign
+- -float(law.slope)
++ float(law.slope)
+# export/urdf.py
+## test_written_back.py::test_a_urdf_file_is_written_again_with_the_numbers_of_the_fit[whole]
+a link of a URDF file with the change of its body alone
+- own += change
++ own = change
 # export/friction.py
 ## test_written_back.py::test_coulomb_and_viscous_friction_are_read_off_a_curve
 friction written back with the other sign

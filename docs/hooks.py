@@ -80,7 +80,7 @@ def effects() -> str:
 
 def _place(name: str) -> str:
     """Place of a law in MuJoCo, if it has one."""
-    return (PLACES[name].__doc__ or "").partition("\n")[0] if name in PLACES else "-"
+    return PLACES[name].where if name in PLACES else "-"
 
 
 def verdict() -> str:

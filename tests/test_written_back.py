@@ -20,7 +20,7 @@ from written_back import ahead
 from nnap_em import identify
 from nnap_em.data.machine import Machine, unpacked
 from nnap_em.data.rig import Declared, Rig, read_rig
-from nnap_em.effects.actuator import Saturation
+from nnap_em.effects.actuator import ActuatorLag, Saturation
 from nnap_em.effects.body import Payload
 from nnap_em.effects.position import Cogging, TorsionalSpring
 from nnap_em.effects.rate import BackEmf
@@ -120,15 +120,21 @@ def _of_file(folder: Path, file: str, more: str, effects=()) -> tuple[Machine, I
     return machine, begin(rig, logs, key=jax.random.key(0), effects=effects)
 
 
+SERVO = [
+    "the position servo of u: kp = 9",
+    "actuator_lag at joint 1: tau = 0.03 (its command is that of a servo)",
+]
 INPUT = '[input]\ncolumns = ["u"]\njoints = [1]\n'
 
 
 @pytest.mark.parametrize(
     ("file", "servo", "left"),
-    [("branch.xml", "", []), ("arm.urdf", 'kind = "position"\nkp = 9.0\n', ["the position servo of u: kp = 9"])],
+    [("branch.xml", "", []), ("arm.urdf", 'kind = "position"\nkp = 9.0\n', SERVO)],
+    ids=["branch", "urdf, servo"],
 )
 def test_a_written_machine_is_the_same_in_mujoco(tmp_path, file, servo, left):
-    machine, fitted = _of_file(tmp_path, file, INPUT + servo)
+    effects = (ActuatorLag.of(0.03, joint=1),) if servo else ()
+    machine, fitted = _of_file(tmp_path, file, INPUT + servo, effects)
     joints = [joint.name for joint in machine.joints]
     assert write_mjcf(fitted, tmp_path / "out.xml") == left
     written, system = mujoco.MjModel.from_xml_path(str(tmp_path / "out.xml")), fitted.model.system

@@ -35,8 +35,6 @@ class FrictionForm(NamedTuple):
     """[N m or N]"""
     smooth: float = 0.0
     """Velocity over which the sign changes [rad/s or m/s]."""
-    fastest: float = 0.0
-    """Largest velocity of the curve [rad/s or m/s]."""
     missed: float = 0.0
     """Root mean square of the rest of the curve, over that of the curve [1]."""
 
@@ -50,7 +48,7 @@ def friction_form(
     uncertainty; a dip narrower than the sign is none, as its breakaway torque is never reached.
     """
     if not np.any(torque):
-        return FrictionForm(fastest=float(np.max(np.abs(v))))
+        return FrictionForm()
     weight = 1 / np.maximum(std, 0.05 * np.max(np.abs(torque), initial=1e-300))
     fits = {kind: _form(v, torque, weight, *kind) for kind in itertools.product((False, True), repeat=2)}
     fits = {kind: form for kind, form in fits.items() if not kind[1] or form.stribeck > form.smooth}
@@ -93,4 +91,4 @@ def _form(
     coulomb, breakaway, stribeck, viscous, smooth, offset = value.tolist()
     residual = torque - curve(value, v)
     share = np.sqrt(np.average(residual**2, weights=weight) / max(np.average(torque**2, weights=weight), 1e-300))
-    return FrictionForm(coulomb, breakaway, stribeck if dip else 1.0, viscous, offset, smooth, top, float(share))
+    return FrictionForm(coulomb, breakaway, stribeck if dip else 1.0, viscous, offset, smooth, float(share))

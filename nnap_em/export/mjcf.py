@@ -19,7 +19,7 @@ from ..storage.files import replace_own
 from ..systems.tree import Tree
 from .friction import REPORTED_MISS, FrictionForm, friction_forms
 from .model import ExportError
-from .placement import Drive, OpenFile, acting_on, late, placed, sensor
+from .placement import Drive, OpenFile, late, placed, sensor
 
 
 class Motor(NamedTuple):
@@ -54,21 +54,17 @@ def write_mjcf(fitted: Identified, out: Path | str) -> list[str]:
         raise ExportError("it is from before fits held their machine's file; identify again")
     file = _opened(fitted, system, forms)
     unplaced = placed(file, model.effects)
-    left = servos_of(fitted) + [
-        f"friction of {name}: its form misses {100 * form.missed:.0f} % of the learned curve"
-        for name, form in zip(system.coordinates, forms, strict=True)
-        if form.missed > REPORTED_MISS
-    ]
-    left += [
-        f"breakaway of {name}: {form.breakaway:.3g} over a Coulomb friction of {form.coulomb:.3g}"
-        for name, form in zip(system.coordinates, forms, strict=True)
-        if form.breakaway > form.coulomb
-    ]
+    left = servos_of(fitted)
+    for name, form in zip(system.coordinates, forms, strict=True):
+        if form.missed > REPORTED_MISS:
+            left.append(f"friction of {name}: its form misses {100 * form.missed:.0f} % of the learned curve")
+        if form.breakaway > form.coulomb:
+            left.append(f"breakaway of {name}: {form.breakaway:.3g} over a Coulomb friction of {form.coulomb:.3g}")
     left += [f"{named(effect)} ({reason})" for effect, reason in unplaced]
     _springs(file)
     _noise(file, np.exp(0.5 * np.asarray(model.log_r)))
     for motor, element in zip(motors_of(fitted, system), list(file.spec.actuators), strict=False):
-        if motor.joint + 1 not in served(fitted):
+        if motor.joint + 1 in file.drives or motor.joint + 1 not in system.joints:  # else the command of a servo
             _motor(file, motor, element)
     notes = "".join(f"\n  - {line}" for line in left) or " nothing"
     comment = f"Written by nnap_em {__version__} from {system.machine.file}.  Not in here:{notes} "
@@ -90,12 +86,6 @@ def as_it_is(fitted: Identified) -> Tree:
     true = hooks.machine(model.effects, system, jnp.zeros(()))
     assert isinstance(true, Tree)
     return true
-
-
-def served(fitted: Identified) -> list[int]:
-    """Joints, counted from 1, whose inputs are commands of servos."""
-    pairs = zip(fitted.model.servos or (), fitted.model.system.joints, strict=False)
-    return [joint for servo, joint in pairs if servo.feeds_back]
 
 
 def servos_of(fitted: Identified) -> list[str]:
@@ -144,10 +134,12 @@ def _opened(fitted: Identified, system: Tree, forms: Sequence[FrictionForm]) -> 
     for j, (joint, form) in enumerate(zip(machine.joints, forms, strict=True)):
         stiffness = float(system.values.get(f"{joint.name}.stiffness", joint.stiffness))
         pull[j, :2] = stiffness * joint.rest + form.offset, -stiffness
-    drives = {joint: Drive() for joint in system.joints if joint not in served(fitted)}
+    servos = fitted.model.servos or (None,) * len(system.joints)
+    pairs = zip(system.joints, servos, strict=True)
+    drives = {joint: Drive() for joint, servo in pairs if servo is None or not servo.feeds_back}
     file = OpenFile(spec, system, fitted.rig.measured, fitted.model.dt, step, pull, drives)
     for motor in motors_of(fitted, system)[len(machine.motors) :]:
-        acting_on(file, machine.joints[motor.joint].name, motor.name, motor.gear)
+        _acting_on(file, machine.joints[motor.joint].name, motor.name, motor.gear)
     return file
 
 
@@ -160,6 +152,15 @@ def _bodies(simulated: Any, system: Tree) -> None:
             simulated.body_inertia[i], axes = np.linalg.eigh(inertia)
             axes[:, 2] *= np.linalg.det(axes)
             mujoco().mju_mat2Quat(simulated.body_iquat[i], axes.ravel())
+
+
+def _acting_on(file: OpenFile, joint: str, name: str, gear: float) -> Any:
+    """A new motor of a joint, with nothing of the classes of the file."""
+    motor = file.spec.add_actuator(name=name, target=joint, trntype=mujoco().mjtTrn.mjTRN_JOINT)
+    motor.set_to_motor()
+    motor.gear = [gear, 0.0, 0.0, 0.0, 0.0, 0.0]
+    motor.ctrllimited = motor.forcelimited = motor.actlimited = False
+    return motor
 
 
 def _springs(file: OpenFile) -> None:
@@ -175,7 +176,7 @@ def _springs(file: OpenFile) -> None:
 
 def _constant(file: OpenFile, joint: str, torque: float) -> None:
     """A constant torque, which MuJoCo has as the cogging without poles of a motor without input; since MuJoCo 4.0."""
-    motor, quarter = acting_on(file, joint, f"{joint}_offset", 1.0), 0.5 * math.pi
+    motor, quarter = _acting_on(file, joint, f"{joint}_offset", 1.0), 0.5 * math.pi
     none = int(mujoco().mjtCtrlInput.mjINPUT_NONE)
     motor.set_to_dcmotor(motorconst=[0.0, 0.0], resistance=1.0, ctrlspec=none, cogging=(torque, 0.0, quarter))
 
@@ -198,11 +199,8 @@ def _motor(file: OpenFile, motor: Motor, element: Any) -> None:
     unit, drive = abs(motor.unit), file.drives.get(motor.joint + 1, Drive())
     if motor.kind != TORQUE:
         element.set_to_motor()
-    if math.isfinite(drive.before):
-        element.ctrllimited, element.ctrlrange = True, [-drive.before / unit, drive.before / unit]
-    if math.isfinite(drive.after):
-        after = drive.after * abs(element.gainprm[0]) / unit
-        element.forcelimited, element.forcerange = True, [-after, after]
+    if math.isfinite(drive.limit):
+        element.ctrllimited, element.ctrlrange = True, [-drive.limit / unit, drive.limit / unit]
     late(element, drive.delay, file.step)
     if drive.lag:
         element.dyntype = mujoco().mjtDyn.mjDYN_FILTEREXACT

@@ -1,4 +1,4 @@
-"""The table from a law to its plain place in MuJoCo: one entry a law, each a function that writes it to a file."""
+"""The table from a law to its plain place in MuJoCo, with the function that writes it to a file."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -17,17 +17,15 @@ class NoPlace(Exception):
 
 
 class Drive(NamedTuple):
-    """The way from a command to a torque: limit, delay, lag, gain, limit, in this order."""
+    """The way from a command to a torque: limit, delay, lag, gain, in this order."""
 
-    before: float = math.inf
+    limit: float = math.inf
     """Limit of the command, in its unit."""
     delay: float = 0.0
     """[s]"""
     lag: float = 0.0
     """Time constant [s]."""
     gain: float = 1.0
-    after: float = math.inf
-    """Limit of what the gain gives, in the unit of the command."""
 
 
 class OpenFile(NamedTuple):
@@ -47,16 +45,17 @@ class OpenFile(NamedTuple):
     drives: dict[int, Drive]
     """Drives by joint, counted from 1."""
 
-    def joint(self, number: int) -> Any:
-        """Joint of the file by its number, counted from 1."""
-        return self.spec.joint(self.system.machine.joints[number - 1].name)
-
     def with_drive(self, joint: int, **changes: float) -> None:
         """Change the drive of one joint."""
         self.drives[joint] = self.drives[joint]._replace(**changes)
 
 
-Place = Callable[[OpenFile, Any], None]
+class Place(NamedTuple):
+    """An element of MuJoCo that holds a law."""
+
+    where: str
+    """Its name in a table."""
+    write: Callable[[OpenFile, Any], None] = lambda file, law: None
 
 
 def placed(file: OpenFile, effects: Sequence[AbstractEffect]) -> tuple[tuple[AbstractEffect, str], ...]:
@@ -75,7 +74,7 @@ def placed(file: OpenFile, effects: Sequence[AbstractEffect]) -> tuple[tuple[Abs
                 raise NoPlace("its command is that of a servo")
             if effect.name not in PLACES:
                 raise NoPlace("it has no plain element in MuJoCo")
-            PLACES[effect.name](file, effect)
+            PLACES[effect.name].write(file, effect)
         except NoPlace as reason:
             unplaced.append((effect, str(reason)))
     return tuple(unplaced)
@@ -96,79 +95,43 @@ def _follower(effects: Sequence[AbstractEffect], place: int) -> AbstractEffect |
     return next((effect for effect in after if effect.name not in PLACES), None)
 
 
-# --- forces at a joint
+def _spring(file: OpenFile, law: Any) -> None:
+    file.pull[law.joint - 1] += float(law.moment), -float(law.slope), -float(law.square), -float(law.cube)
 
 
-def _spring(file: OpenFile, effect: Any) -> None:
-    """`stiffness` (a cubic) and `springref` of the joint; since MuJoCo 3.7."""
-    pull = float(effect.moment), -float(effect.slope), -float(effect.square), -float(effect.cube)
-    file.pull[effect.joint - 1] += pull
+def _offset(file: OpenFile, law: Any) -> None:
+    file.pull[law.joint - 1, 0] += float(law.value)
 
 
-def _offset(file: OpenFile, effect: Any) -> None:
-    """Passive `<dcmotor>`, `cogging` without poles, since MuJoCo 4.0; with a spring its `springref`."""
-    file.pull[effect.joint - 1, 0] += float(effect.value)
+def _back_emf(file: OpenFile, law: Any) -> None:
+    file.spec.joint(file.system.machine.joints[law.joint - 1].name).damping[0] += float(law.b)
 
 
-def acting_on(file: OpenFile, joint: str, name: str, gear: float) -> Any:
-    """A new motor of a joint, with nothing of the classes of the file."""
-    motor = file.spec.add_actuator(name=name, target=joint, trntype=mujoco().mjtTrn.mjTRN_JOINT)
-    motor.set_to_motor()
-    motor.gear = [gear, 0.0, 0.0, 0.0, 0.0, 0.0]
-    motor.ctrllimited = motor.forcelimited = motor.actlimited = False
-    return motor
+def _gain(file: OpenFile, law: Any) -> None:
+    file.with_drive(law.joint, gain=file.drives[law.joint].gain * (1 + float(law.excess)))
 
 
-def _back_emf(file: OpenFile, effect: Any) -> None:
-    """`damping` of the joint."""
-    file.joint(effect.joint).damping[0] += float(effect.b)
-
-
-# --- bodies
-
-
-def _payload(file: OpenFile, effect: Any) -> None:
-    """Mass, centre and inertia of the body."""  # that of `OpenFile.system`
-
-
-# --- between command and torque
-
-
-def _gain(file: OpenFile, effect: Any) -> None:
-    """`gainprm` of the motor."""
-    drive, gain = file.drives[effect.joint], 1 + float(effect.excess)
-    file.with_drive(effect.joint, gain=drive.gain * gain, after=drive.after * abs(gain))
-
-
-def _saturation(file: OpenFile, effect: Any) -> None:
-    """`ctrlrange` of the motor or, behind a lag, `forcerange`."""
-    drive, limit = file.drives[effect.joint], float(effect.limit)
+def _saturation(file: OpenFile, law: Any) -> None:
+    drive = file.drives[law.joint]
     if drive.lag:
-        return file.with_drive(effect.joint, after=min(drive.after, limit))
-    return file.with_drive(effect.joint, before=min(drive.before, limit / abs(drive.gain)))
+        raise NoPlace("it acts behind a lag")
+    file.with_drive(law.joint, limit=min(drive.limit, float(law.limit) / abs(drive.gain)))
 
 
-def _delay(file: OpenFile, effect: Any) -> None:
-    """`delay`, `nsample` and `interp="linear"` of the motor; since MuJoCo 3.5."""
-    file.with_drive(effect.joint, delay=file.drives[effect.joint].delay + max(float(effect.delay), 0.0))
+def _delay(file: OpenFile, law: Any) -> None:
+    file.with_drive(law.joint, delay=file.drives[law.joint].delay + max(float(law.delay), 0.0))
 
 
-def _lag(file: OpenFile, effect: Any) -> None:
-    """`dyntype="filterexact"` of the motor."""
-    drive = file.drives[effect.joint]
-    if drive.lag or math.isfinite(drive.after):
-        raise NoPlace("an actuator has one state, and no limit before it but that of the command")
-    file.with_drive(effect.joint, lag=max(float(effect.tau), 0.05 * file.dt))
+def _lag(file: OpenFile, law: Any) -> None:
+    if file.drives[law.joint].lag:
+        raise NoPlace("an actuator has one state")
+    file.with_drive(law.joint, lag=max(float(law.tau), 0.05 * file.dt))
 
 
-# --- readings
-
-
-def _sensor_delay(file: OpenFile, effect: Any) -> None:
-    """`delay`, `nsample` and `interp="linear"` of the sensor; since MuJoCo 3.5."""
+def _sensor_delay(file: OpenFile, law: Any) -> None:
     for column in file.measured:
-        if effect.channel in (column, "all") and (one := sensor(file, column) or _joint_sensor(file, column)):
-            late(one, max(float(effect.delay), 0.0), file.step)
+        if law.channel in (column, "all"):
+            late(sensor(file, column) or _joint_sensor(file, column), max(float(law.delay), 0.0), file.step)
 
 
 def sensor(file: OpenFile, column: str) -> Any:
@@ -178,11 +141,10 @@ def sensor(file: OpenFile, column: str) -> Any:
 
 def _joint_sensor(file: OpenFile, column: str) -> Any:
     """A new sensor of a joint, by the name of its state."""
-    machine, kinds = file.system.machine, mujoco().mjtSensor
-    rate, place = divmod(machine.states.index(column), len(machine.joints))
+    joints, kinds = file.system.machine.joints, mujoco().mjtSensor
+    rate, place = divmod(file.system.machine.states.index(column), len(joints))
     kind = kinds.mjSENS_JOINTVEL if rate else kinds.mjSENS_JOINTPOS
-    joint = machine.joints[place].name
-    return file.spec.add_sensor(name=column, type=kind, objtype=mujoco().mjtObj.mjOBJ_JOINT, objname=joint)
+    return file.spec.add_sensor(name=column, type=kind, objtype=mujoco().mjtObj.mjOBJ_JOINT, objname=joints[place].name)
 
 
 def late(element: Any, delay: float, step: float) -> None:
@@ -194,20 +156,19 @@ def late(element: Any, delay: float, step: float) -> None:
         element.nsample, element.interp = room * (math.ceil(delay / step) + 1), 1
 
 
-def _quantisation(file: OpenFile, effect: Any) -> None:
-    """`noise` of the sensor, as the fitted noise of the reading has the rounding already."""
-
-
+LATE = '`delay`, `nsample` and `interp="linear"` of the {}; since MuJoCo 3.5'
 PLACES: Mapping[str, Place] = {
-    "torsional_spring": _spring,
-    "torque_offset": _offset,
-    "motor_back_emf": _back_emf,
-    "payload": _payload,
-    "motor_gain": _gain,
-    "saturation": _saturation,
-    "input_delay": _delay,
-    "actuator_lag": _lag,
-    "sensor_delay": _sensor_delay,
-    "sensor_quantization": _quantisation,
+    "torsional_spring": Place("`stiffness` (a cubic) and `springref` of the joint; since MuJoCo 3.7", _spring),
+    "torque_offset": Place(
+        "passive `<dcmotor>`, `cogging` without poles, since MuJoCo 4.0; with a spring its `springref`", _offset
+    ),
+    "motor_back_emf": Place("`damping` of the joint", _back_emf),
+    "payload": Place("mass, centre and inertia of the body"),  # those of `OpenFile.system`
+    "motor_gain": Place("`gainprm` of the motor", _gain),
+    "saturation": Place("`ctrlrange` of the motor", _saturation),
+    "input_delay": Place(LATE.format("motor"), _delay),
+    "actuator_lag": Place('`dyntype="filterexact"` of the motor', _lag),
+    "sensor_delay": Place(LATE.format("sensor"), _sensor_delay),
+    "sensor_quantization": Place("`noise` of the sensor, as the fitted noise of the reading has the rounding already"),
 }
-"""Functions that add a law to the content, by its name in the catalogue; first lines are the places in a table."""
+"""Places of laws, by their names in the catalogue."""

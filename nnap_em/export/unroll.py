@@ -147,7 +147,7 @@ class _Writer:
         key = (op.c, *((type(value), repr(value)) for value in values))  # NaN is not itself, its text is
         return self.lines.setdefault(key, Line(f"t{len(self.lines)}", op, values, whole)).name
 
-    def each(self, op: Op, whole: bool, *operands: np.ndarray) -> np.ndarray:
+    def each(self, op: Op, whole: bool, *operands: Any) -> np.ndarray:
         """An operation on arrays, entry by entry."""
         return np.frompyfunc(lambda *values: self.write(op, whole, *values), len(operands), 1)(*operands)
 
@@ -188,7 +188,7 @@ class _Writer:
             low, x, high = operands
             return [self.each(_OPS["min"], whole, self.each(_OPS["max"], whole, x, low), high)]
         if name == "dot_general":
-            return [self.dot(*operands, params["dimension_numbers"], whole)]
+            return [self.dot(operands[0], operands[1], params["dimension_numbers"], whole)]
         if name in ("scatter-add", "scatter-mul"):
             return [self.scatter(equation, whole, *operands)]
         if name in _REDUCTIONS:
@@ -306,6 +306,10 @@ def _kind(atom: Any) -> str:
     return atom.aval.dtype.kind
 
 
+def _shape(atom: Any) -> tuple[int, ...]:
+    return atom.aval.shape
+
+
 def _typed(value: np.ndarray, atom: Any) -> jax.Array:
     """Numbers alone, of the type that JAX has for them."""
     return jnp.asarray(value.tolist(), atom.aval.dtype).reshape(value.shape)
@@ -337,7 +341,8 @@ def _by_jax(equation: core.JaxprEqn, operands: list[np.ndarray]) -> list[np.ndar
 
 def _moved(equation: core.JaxprEqn, operands: list[np.ndarray]) -> list[np.ndarray]:
     """Operations that move numbers: the commonest by NumPy, others by JAX on their places."""
-    name, params, shape, first = equation.primitive.name, equation.params, equation.outvars[0].aval.shape, operands[0]
+    name, params, first = equation.primitive.name, equation.params, operands[0]
+    shape = _shape(equation.outvars[0])
     if name in ("reshape", "squeeze"):
         return [first.reshape(shape)]
     if name == "broadcast_in_dim":

@@ -85,7 +85,7 @@ def _add(link: ET.Element, change: Float[np.ndarray, "4 4"]) -> bool:
     inertial = link.find("inertial")
     inertial = ET.SubElement(link, "inertial") if inertial is None else inertial
     parts = {part.tag: part.attrib for part in inertial}
-    numbers = lambda tag, key, default: np.array(parts.get(tag, {}).get(key, default).split(), float)  # noqa: E731
+    numbers = lambda tag, key, default: np.array(str(parts.get(tag, {}).get(key, default)).split(), float)  # noqa: E731
     inertia = np.zeros((3, 3))
     for i, j in PAIRS:
         inertia[i, j] = inertia[j, i] = numbers("inertia", f"i{AXES[i]}{AXES[j]}", "0")[0]

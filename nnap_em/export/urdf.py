@@ -36,8 +36,8 @@ def write_urdf(fitted: Identified, out: Path | str) -> list[str]:
             f"{system.machine.file} is no URDF file, or the fit is older; write --mjcf, or identify again"
         )
     root = ET.fromstring(fitted.rig.urdf, ET.XMLParser(target=ET.TreeBuilder(insert_comments=True)))
-    # Laws that URDF holds, by name: in the numbers of the bodies and in the damping
-    laws = ("payload", "motor_back_emf")
+    # Laws that URDF holds, by name: in the numbers of bodies, in damping and in effort
+    laws = ("payload", "motor_back_emf", "saturation")
     left = servos_of(fitted) + [named(effect) for effect in fitted.model.effects if effect.name not in laws]
     elements = {str(element.get("name")): element for element in root if element.tag == "joint"}
     for number, (joint, form) in enumerate(zip(system.machine.joints, forms, strict=True), 1):

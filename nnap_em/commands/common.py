@@ -1,7 +1,10 @@
 """Common parts of the commands: set-up, data sets, model files, and runs that go on after a stop."""
 
 import argparse
+import hashlib
 import os
+import platform
+import re
 import tempfile
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
@@ -62,7 +65,7 @@ def set_up() -> None:
         use_every_device()
     folder = getattr(jax.config, "jax_compilation_cache_dir", None)
     if folder is None:
-        folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "nnap_em" / "jax"
+        folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "nnap_em" / "jax" / _processor()
         with suppress(OSError):
             folder.mkdir(parents=True, exist_ok=True)
         if not os.access(folder, os.W_OK):
@@ -72,6 +75,15 @@ def set_up() -> None:
     elif "JAX_COMPILATION_CACHE_DIR" not in os.environ:  # it was set in this process, not for commands
         return
     use_cache(Path(folder) / "traced")
+
+
+def _processor() -> str:
+    """Digest of the features of the processor: a program of another one may end with an illegal instruction here."""
+    try:
+        features = re.search(r"(?m)^(flags|Features).*", Path("/proc/cpuinfo").read_text())
+    except OSError:
+        features = None
+    return hashlib.sha256((features[0] if features else platform.machine()).encode()).hexdigest()[:16]
 
 
 class Bench(NamedTuple):

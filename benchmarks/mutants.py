@@ -691,10 +691,6 @@ a held body placed along the axes of the world
 branches of a choice in C the other way round
 - ("{0} ? {2} : {1}",
 + ("{0} ? {1} : {2}",
-## test_unroll.py::test_what_c_has_not_is_refused_by_name[whole numbers divided]
-whole numbers divided as floating ones
-- if reason:
-+ if False:
 # export/placement.py
 ## test_played.py::test_a_law_in_the_file_accelerates_as_in_the_library[torsional_spring]
 a spring written with the other sign

@@ -522,10 +522,15 @@ def test_a_search_begins_at_the_whole_length_unless_most_sequences_are_lost_ther
     for short, whole, first in ((every, most, 9), (every, few, 4), (few, few, 4)):
         assert search.lengths_of(CONTEXT._replace(stages={4: (None, short), 9: (None, whole)})) == [first]
     long = Dataset(*(np.zeros((1, 500, *part.shape[2:])) for part in DATA[:3]), np.ones((1, 500), bool))
-    stages = dict.fromkeys([60, 96, 154, 246, 393, 500], (None, every))
     hidden = BEFORE.state._replace(best=dataclasses.replace(MODEL, measured=(1,)))
-    for state, white, lengths in ((hidden, True, [60, 96, 246]), (hidden, False, [500]), (BEFORE.state, True, [500])):
-        context = CONTEXT._replace(stages=stages, data=long, white=white, before=BEFORE._replace(state=state))
+    for state, white, short, lengths in (
+        (hidden, True, [60, 96, 140], [60, 96, 246]),
+        (hidden, True, [60, 154], [60, 246]),
+        (hidden, False, [60, 96], [500]),
+        (BEFORE.state, True, [60, 96], [500]),
+    ):
+        stages, before = dict.fromkeys([*short, 246, 393, 500], (None, every)), BEFORE._replace(state=state)
+        context = CONTEXT._replace(stages=stages, data=long, white=white, before=before)
         assert search.lengths_of(context) == lengths
 
 

@@ -464,6 +464,16 @@ def test_what_weighs_nothing_changes_nothing(tmp_path, capfd):
         )
 
 
+def test_the_rotor_of_a_transmission_is_said_to_be_left_out(tmp_path, recwarn):
+    path, block = tmp_path / "m.urdf", '\n<transmission name="t"><joint name="j1"/>{}</transmission>'
+    path.write_text(_urdf(ARM + block.format("<mechanicalReduction>101</mechanicalReduction>")))
+    plain = read_machine(path)  # torques are those at the joint
+    assert not recwarn
+    path.write_text(_urdf(ARM + block.format("<motorInertia>5e-5</motorInertia>")))
+    with pytest.warns(RigWarning, match="line 3: the rotor of a <transmission> is not read; write its inertia times"):
+        assert read_machine(path) == plain
+
+
 FINGERS = _links("f1", "f2") + _links("tip", inside="") + _turning("open", "l2", "f1", kind="prismatic")
 FINGERS += _turning("follow", "l2", "f2", '<mimic joint="open" multiplier="-1" offset="0.02"/>', "prismatic")
 FINGERS += _turning("button", "f1", "tip")

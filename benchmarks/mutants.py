@@ -566,9 +566,18 @@ an encoder that creeps taken for a held one
 + 0.1 * float
 # data/counters.py
 ## test_counters.py::test_what_machines_do_is_no_counter
-a spike that comes back taken for a counter
-- (before & after)[alone]
-+ (before | after)[alone]
+motion against the jump on one side taken for a counter
+- (way * before > moved) & (way * after > moved)
++ (way * before > moved) | (way * after > moved)
+# data/rough.py
+## test_rough.py::test_one_count_of_an_encoder_is_no_spike_of_its_rate
+a count of an encoder taken for a spike of its rate
+- 2 * resolution(
++ 0 * resolution(
+## test_rough.py::test_a_late_and_a_saturated_sensor_are_found
+a stop taken on the wrong side of its limit
+- np.max(sign * inside if
++ np.max(-sign * inside if
 # em/build.py
 ## test_check.py::test_a_machine_at_one_speed_has_come_to_it_within_a_sequence
 acceleration held against a speed

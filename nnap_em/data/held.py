@@ -1,14 +1,33 @@
 """Sample and hold: readings that stand in several rows, because the sensor is slower than the log."""
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from .constant import runs
-
 HELD_ROWS = 1.5
 """Mean rows of a reading from which on the repeats are taken as missing: below, most rows hold one of their own."""
+
+
+class Run(NamedTuple):
+    """Equal readings in the rows from `first` to before `end`; some may be missing."""
+
+    first: int
+    end: int
+
+    @property
+    def length(self) -> int:
+        """Rows."""
+        return self.end - self.first
+
+
+def runs(y: Float[np.ndarray, " time"]) -> list[Run]:
+    """All readings as runs of equal ones, missing samples among them left out."""
+    k = np.flatnonzero(np.isfinite(y))
+    new = np.append(True, np.diff(y[k]) != 0)[: k.size]
+    last = np.append(new[1:], True)[: k.size]
+    return [Run(a, b) for a, b in zip(k[new].tolist(), (k[last] + 1).tolist(), strict=True)]
 
 
 def hold(signals: Sequence[Float[np.ndarray, " _"]]) -> float:

@@ -11,7 +11,6 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ..numerics.digits import counted
-from .constant import FULL
 from .dataset import DataError, Dataset, pad
 from .formats import check_size, columns_of, header_hint, log_files, place, refuse, table_of, untimed
 from .held import hold
@@ -19,12 +18,13 @@ from .held import repeats as held_rows
 from .missing import interpolated
 from .plausible import Columns, implausible, repeats
 from .rig import Rig
-from .rough import Rough, rough
+from .rough import FULL, Rough, rough
 from .units import is_episode, other_unit
 
 TOLERANCE = 0.01  # of the declared dt, for every interval
 OTHER_UNIT = 100.0  # times the declared value of a column that scales a servo: V beside mV, and no gain changes so much
 REPEAT, RANGE = "held", "range"
+_Parts = tuple[np.ndarray, np.ndarray, np.ndarray]
 _REASONS = {
     REPEAT: "equal to the one before, until the sensor takes its next",
     RANGE: "at the end of the declared range of the sensor",
@@ -103,16 +103,18 @@ def read_logs(folder: Path | str, rig: Rig, *, trust: bool = False, until: float
     tables = [_read_table(path, rig) for path in files]
     tables = [_without(table, RANGE, _at_ends(table.readings(rig), rig), rig) for table in tables]
     early = [table.readings(rig, until) for table in tables]
-    if held := {} if trust else _held(early):
+    stands = {} if trust else {name: hold([readings[name] for readings in early]) for name in rig.measured}
+    if held := {name: rows for name, rows in stands.items() if rows > 1}:
         again = [{name: held_rows(table.readings(rig)[name], rows) for name, rows in held.items()} for table in tables]
         tables = [_without(table, REPEAT, rows, rig) for table, rows in zip(tables, again, strict=True)]
         early = [table.readings(rig, until) for table in tables]
     entries = [[] if trust else rough(readings, rig.dt) for readings in early]
-    if limits := {limit for readings, each in zip(early, entries, strict=True) for limit in _limits(readings, each)}:
-        entries = [rough(readings, rig.dt, limits) for readings in early]
+    found = ((each, readings) for readings, entry in zip(early, entries, strict=True) for each in entry)
+    full = {(each.column, y) for each, readings in found if each.kind == FULL for y in readings[each.column][each.rows]}
+    entries = [rough(readings, rig.dt, full) for readings in early] if full else entries
     sequences = [_sequence(table, each, rig) for table, each in zip(tables, entries, strict=True)]
-    data, masked = pad([s.used for s in sequences]), tuple(m for s in sequences for m in s.masked)
-    unmasked = pad([s.as_read for s in sequences]) if masked else None
+    data, masked = pad([used for used, _, _ in sequences]), tuple(m for *_, each in sequences for m in each)
+    unmasked = pad([as_read for _, as_read, _ in sequences]) if masked else None
     return Logs(tuple(path.name for path in files), data, (*rig.logged_inputs, *rig.measured), masked, unmasked)
 
 
@@ -180,7 +182,7 @@ def together(parts: Mapping[str, Logs]) -> Logs:
     return Logs(files, pad([s for logs in every for s in _unpadded(logs.data)]), first[1].columns, masked, unmasked)
 
 
-def _unpadded(data: Dataset) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+def _unpadded(data: Dataset) -> Iterator[_Parts]:
     """Time, inputs and readings of every sequence, without padding."""
     t, u, y, valid = map(np.asarray, data)
     return ((a[rows], b[rows], c[rows]) for a, b, c, rows in zip(t, u, y, valid, strict=True))
@@ -207,12 +209,6 @@ class _Table(NamedTuple):
         return dict(zip(rig.measured, self.table[early, 1 + len(rig.logged_inputs) :].T, strict=True))
 
 
-def _held(logs: Sequence[Mapping[str, np.ndarray]]) -> dict[str, float]:
-    """Columns whose readings stand in more rows than one, and in how many."""
-    rows = {name: hold([readings[name] for readings in logs]) for name in logs[0]}
-    return {name: each for name, each in rows.items() if each > 1}
-
-
 def _at_ends(readings: Columns, rig: Rig) -> dict[str, Int[np.ndarray, " row"]]:
     """Rows at the declared ends of the sensors, whose tangent there would be 0."""
     outside = {name: (readings[name] <= low) | (readings[name] >= high) for name, (low, high) in rig.ranges.items()}
@@ -236,20 +232,6 @@ def _masked(source: _Table, kind: str, column: str, rows: Int[np.ndarray, " row"
     hint = "not used" if kind == RANGE else "not used; to use them: --trust-readings, or read_logs(..., trust=True)"
     warnings.warn(f"{source.path}: {place(source.path, column, line)}: {problem}; {hint}", DataWarning, 2)
     return Masked(source.path.name, kind, column, line + 1, t, rows.size)
-
-
-def _limits(readings: Columns, entries: Sequence[Rough]) -> set[tuple[str, float]]:
-    """Columns and the values at which they saturate."""
-    flat = [(entry.column, readings[entry.column][entry.rows]) for entry in entries if entry.kind == FULL]
-    return {(column, float(limit)) for column, y in flat for limit in (y.min(), y.max()) if np.sum(y == limit) > 2}
-
-
-class _Sequence(NamedTuple):
-    """One file: t, u, y as a fit sees them, the same with all readings, and what is masked."""
-
-    used: tuple[np.ndarray, np.ndarray, np.ndarray]
-    as_read: tuple[np.ndarray, np.ndarray, np.ndarray]
-    masked: list[Masked]
 
 
 def _read_table(path: Path, rig: Rig) -> _Table:
@@ -283,8 +265,8 @@ def _check_scales(path: Path, table: Float[np.ndarray, "row column"], rig: Rig) 
                 refuse(path, place(path, column), problem, "write both in one unit")
 
 
-def _sequence(source: _Table, entries: Sequence[Rough], rig: Rig) -> _Sequence:
-    """One file, checked against the rig, without what was found in it."""
+def _sequence(source: _Table, entries: Sequence[Rough], rig: Rig) -> tuple[_Parts, _Parts, list[Masked]]:
+    """t, u, y of one file, checked against the rig, as a fit sees them and with all readings, and what is masked."""
     path, table, line = source.path, source.table, source.line
     first = 1 + len(rig.logged_inputs)
     t, u, read = table[:, 0], table[:, 1:first], table[:, first:]
@@ -295,10 +277,10 @@ def _sequence(source: _Table, entries: Sequence[Rough], rig: Rig) -> _Sequence:
     for finding in implausible(inputs, readings, rig.dt, rig.unit, rig.pairs()):
         where = place(path, finding.column, None if finding.row is None else int(line[finding.row]))
         if finding.ruins:
-            refuse(path, where, finding.problem, finding.mend(path))
+            refuse(path, where, finding.problem, finding.hint)
         warnings.warn(f"{path}: {where}: {finding.problem}; {finding.hint}", DataWarning, 2)
     masked = [*source.masked, *(_masked(source, entry.kind, entry.column, entry.rows) for entry in entries)]
-    return _Sequence((t, u, y), (t, u, read), masked)
+    return (t, u, y), (t, u, read), masked
 
 
 def _rows(path: Path, t: Float[np.ndarray, " time"], rig: Rig) -> Int[np.ndarray, " time"]:

@@ -5,7 +5,6 @@ copies.
 import math
 import shlex
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -39,16 +38,6 @@ class Implausible(NamedTuple):
     row: int | None
     problem: str
     hint: str
-
-    def mend(self, path: Path) -> str:
-        """The hint with the logs of the data set that a file stands in, where these are no copies of other logs."""
-        home = path.parent.parent
-        rig = home / "rig.toml"
-        if not rig.is_file() or "[import.columns]" in rig.read_text(errors="replace"):
-            return self.hint
-        folders = [home / part for part in ("train", "test") if (home / part).is_dir()] or [path.parent]
-        logs = " ".join(f"{shlex.quote(str(folder))}/*" for folder in folders)
-        return self.hint.replace("LOG ... --rig rig.toml", f"{logs} --rig {shlex.quote(str(rig))}")
 
 
 class Repeat(NamedTuple):
@@ -190,7 +179,7 @@ def _advance(values: Float[np.ndarray, " time"], dt: float) -> Float[np.ndarray,
 def _wrapped(name: str, values: Float[np.ndarray, " time"], unit: str) -> Iterator[Implausible]:
     """Jumps of a counter that starts over."""
     rate = unit.endswith("/s")
-    found = counter(values, np.arange(values.size, dtype=float), angle=unit == "rad", rate=rate)
+    found = counter(values, angle=unit == "rad", rate=rate)
     if found is not None:
         row = int(found.rows[0])
         hint = f"take the jumps out: nnap-em import LOG ... --rig rig.toml --out NEW --unwrap {shlex.quote(name)}"

@@ -1,16 +1,17 @@
 """Test of whether logs can identify what is declared, before EM: one line per subject, ok, warning or error."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int, PRNGKeyArray
+from jaxtyping import Float, PRNGKeyArray
 
 from ..data.dataset import Array, Dataset
 from ..data.logs import REPEAT, Logs, logs_of_arrays
+from ..data.machine import unpacked
 from ..data.noise import reading_noise, resolution
 from ..data.rig import HOLD, SMOOTH, Rig, RigError
 from ..data.servo import TORQUE
@@ -31,7 +32,6 @@ from .identifiability import identifiability, sentences
 from .identify import Identified, begin
 from .inverse_dynamics import UNEXPLAINED, Lag, explanations, gains, lag, mistakes, regression
 from .rates import bridged, timings
-from .stops import at_stops
 
 OK, WARNING, ERROR = "ok", "warning", "error"
 SEQUENCES, SECONDS, FEWEST_SAMPLES = 6, 1.0, 10
@@ -91,8 +91,7 @@ def check(
     """
     train, test = logs_of_arrays(train, rig), None if test is None else logs_of_arrays(test, rig)
     data = Dataset(*(np.asarray(part) for part in train.data))
-    amount = [*_amount(rig, data, test), *_missing(train, rig), *_held(train, rig), *_rough(train)]
-    amount += rates(rig, data)
+    amount = [*_amount(rig, data, test), *_missing(train, rig), *_rough(train), *rates(rig, data)]
     if amount[0].mark == ERROR:
         return amount
     try:
@@ -135,25 +134,24 @@ def _equations(rig: Rig, problem: Identified, data: Dataset) -> Iterator[CheckRe
     model, longest = problem.model, float(data.valid.sum(axis=1).max()) * rig.dt
     seen = motion(model, data)
     fastest, growing = 1 / max(seen.fastest, 1e-12), 1 / seen.growth if seen.growth else np.inf
-    hints = [
-        (not len(seen.rate), "no states follow the readings: look at signs, units and parameters"),
-        (growing < 2 * rig.dt, "errors grow too fast between two rows: sample faster, or look at units and signs"),
-        (fastest < rig.dt, "the fastest is over between two rows: sample faster, or look at the units of parameters"),
-        (
-            longest < RECORDED * seen.slowest < np.inf,
-            f"record {RECORDED:g} of the slowest at least, here {longest:.3g} s",
-        ),
-    ]
-    remarks = [hint for holds, hint in hints if holds]
     constants = f"time constants of the declared equations are {fastest:.3g} to {seen.slowest:.3g} s, "
-    modes = [f"rows {rig.dt:g} s apart" if np.isinf(seen.slowest) else f"{constants}rows {rig.dt:g} s apart"]
+    modes = [f"{constants if np.isfinite(seen.slowest) else ''}rows {rig.dt:g} s apart"]
     modes += [f"integrators: {', '.join(seen.kept)}"] if seen.kept else []
-    grown = (
-        f"unstable: deviations of {', '.join(seen.unstable)} grow at {seen.growth:.3g} 1/s, e-fold in {growing:.3g} s"
-    )
-    modes += [grown] if seen.growth else []
+    grown = f"deviations of {', '.join(seen.unstable)} grow at {seen.growth:.3g} 1/s, e-fold in {growing:.3g} s"
+    modes += [f"unstable: {grown}"] if seen.growth else []
+    quick = "the fastest is over between two rows: sample faster, or look at the units of parameters"
+    errors = {
+        "no states follow the readings: look at signs, units and parameters": not len(seen.rate),
+        "errors grow too fast between two rows: sample faster, or look at units and signs": growing < 2 * rig.dt,
+    }
+    warnings = {
+        quick: fastest < rig.dt,
+        f"record {RECORDED:g} of the slowest at least, here {longest:.3g} s": longest
+        < RECORDED * seen.slowest
+        < np.inf,
+    }
     text = f"{'; '.join(modes)}; predictions are judged up to {model.pace:g} s ahead"
-    yield CheckResult(_mark(remarks, hints[0][0] or hints[1][0]), "sampling", "; ".join([text, *remarks]))
+    yield _result("sampling", text, errors, warnings)
     yield from _noise(rig, model, data)
     at = windows(model, data)  # a start that nothing shows, as at rest, is one of many
     place = at.rows * np.arange(at.count)[:, None] + np.arange(at.rows)
@@ -185,20 +183,24 @@ def _std(values: np.ndarray) -> float:
     return float(finite.std()) if finite.size else 0.0
 
 
-def _mark(warning: object, bad: object = False) -> str:
-    return ERROR if bad else WARNING if warning else OK
+def _result(subject: str, text: str, errors: Mapping[str, object], warnings: Mapping[str, object]) -> CheckResult:
+    """A result with the hints of those errors and warnings that hold."""
+    mark = ERROR if any(errors.values()) else WARNING if any(warnings.values()) else OK
+    hints = dict.fromkeys(hint for hint, holds in (*errors.items(), *warnings.items()) if holds)
+    return CheckResult(mark, subject, "; ".join([text, *filter(None, hints)]))
 
 
 def _amount(rig: Rig, data: Dataset, test: Logs | None) -> Iterator[CheckResult]:
     rows = data.valid.sum(axis=1)
-    shortage = "too few; record some minutes" if rows.sum() < 100 or rows.max() < 20 else ""
-    short = f"the shortest is {rows.min() * rig.dt:.2g} s: leave out what is under 60 rows" if rows.min() < 60 else ""
+    few, what = rows.sum() < 100 or rows.max() < 20, "numbers" if rig.equations else "curve"
     too_long = rows.max() * rig.dt > _LONG[0] and rows.max() > _LONG[1] and not rig.equations
-    long = "cut them into sequences of some seconds" if too_long else ""
-    little = f"more would make the {'numbers' if rig.equations else 'curve'} surer" if rows.sum() < 1000 else ""
-    mark = _mark(short or long or little, shortage)
-    amount = f"{counted(len(rows), 'training sequence')}, {rows.sum() * rig.dt:.3g} s, {rows.sum()} rows"
-    yield CheckResult(mark, "length", "; ".join(filter(None, (amount, shortage or little, short, long))))
+    warnings = {
+        f"more would make the {what} surer": rows.sum() < 1000 and not few,
+        f"the shortest is {rows.min() * rig.dt:.2g} s: leave out what is under 60 rows": rows.min() < 60,
+        "cut them into sequences of some seconds": too_long,
+    }
+    text = f"{counted(len(rows), 'training sequence')}, {rows.sum() * rig.dt:.3g} s, {rows.sum()} rows"
+    yield _result("length", text, {"too few; record some minutes": few}, warnings)
     if test is None:
         yield CheckResult(WARNING, "test", "no test sequences: no prediction error will be reported")
     else:
@@ -206,48 +208,36 @@ def _amount(rig: Rig, data: Dataset, test: Logs | None) -> Iterator[CheckResult]
 
 
 def _missing(train: Logs, rig: Rig) -> Iterator[CheckResult]:
-    y, valid = np.asarray(train.data.y), np.asarray(train.data.valid)
-    for i, name in enumerate(rig.measured):
-        gone = np.sum(np.isnan(y[..., i]) & valid, axis=1) - _repeats(train, name)
-        share = gone.sum() / valid.sum()
-        worst = int(np.argmax(gone / valid.sum(axis=1)))
+    """Missing samples of each column, and the rows in which each reading stands, where it is more than one."""
+    rows, repeated = np.asarray(train.data.valid).sum(axis=1), {}
+    for entry in train.masked:
+        if entry.kind == REPEAT:
+            repeated[entry.column, entry.file] = entry.amount
+    for name, y in zip(rig.measured, np.moveaxis(np.asarray(train.data.y), -1, 0), strict=True):
+        read = np.isfinite(y).sum(axis=1)
+        again = np.array([repeated.get((name, file), 0) for file in train.files])
+        gone = rows - read - again
+        share = gone.sum() / rows.sum()
         text = f"{name}: {100 * share:.0f} % of the samples are missing"
-        text += f", most in {train.files[worst]}" if share else ""
-        yield CheckResult(_mark(share > 0.2, share > 0.75), "missing", text)
-
-
-def _repeats(train: Logs, name: str) -> Int[np.ndarray, " seq"]:
-    """Rows of each file that hold a reading over again."""
-    amounts = {entry.file: entry.amount for entry in train.masked if (entry.kind, entry.column) == (REPEAT, name)}
-    return np.array([amounts.get(file, 0) for file in train.files])
-
-
-def _held(train: Logs, rig: Rig) -> Iterator[CheckResult]:
-    """Rows in which each reading stands, where it is more than one."""
-    for i, name in enumerate(rig.measured):
-        again, read = _repeats(train, name), np.isfinite(np.asarray(train.data.y)[..., i]).sum(axis=1)
+        text += f", most in {train.files[int(np.argmax(gone / rows))]}" if share else ""
+        yield _result("missing", text, {"": share > 0.75}, {"": share > 0.2})
         if files := np.count_nonzero(again):
-            rows = 1 + again.sum() / read[again > 0].sum()
-            text = f"{name}: each reading stands in {rows:.3g} rows, in {files} of {counted(len(again), 'file')}; "
-            text += f"all but the first are missing samples: {rows * rig.dt:.3g} s lie between two readings"
+            stands = 1 + again.sum() / read[again > 0].sum()
+            text = f"{name}: each reading stands in {stands:.3g} rows, in {files} of {counted(len(again), 'file')}; "
+            text += f"all but the first are missing samples: {stands * rig.dt:.3g} s lie between two readings"
             yield CheckResult(WARNING, "held", text)
 
 
 def _rough(train: Logs) -> Iterator[CheckResult]:
     """Readings masked on reading, and their share of each column."""
-    total = int(np.asarray(train.data.valid).sum())
     masked = [entry for entry in train.masked if entry.kind != REPEAT]
     for kind, column in dict.fromkeys((entry.kind, entry.column) for entry in masked):
         entries = [entry for entry in masked if (entry.kind, entry.column) == (kind, column)]
-        count, what = sum(entry.amount for entry in entries), f"{column}: " if column else ""
-        amount = counted(count, "reading" if column else "row")
-        files = len({entry.file for entry in entries})
-        text = f"{what}{kind}: {amount} in {files} of {counted(len(train.files), 'file')}"
-        yield CheckResult(
-            _mark(True, count > 0.3 * total),
-            "rough",
-            f"{text}, most in {max(entries, key=lambda entry: entry.amount).file}",
-        )
+        count, where = sum(entry.amount for entry in entries), f"{column}: " if column else ""
+        files = f"{len({entry.file for entry in entries})} of {counted(len(train.files), 'file')}"
+        text = f"{where}{kind}: {counted(count, 'reading' if column else 'row')} in {files}, most in "
+        text += max(entries, key=lambda entry: entry.amount).file
+        yield CheckResult(ERROR if count > 0.3 * np.sum(train.data.valid) else WARNING, "rough", text)
 
 
 def _sampling(rig: Rig, along: Along, scales: Scales) -> Iterator[CheckResult]:
@@ -259,45 +249,40 @@ def _sampling(rig: Rig, along: Along, scales: Scales) -> Iterator[CheckResult]:
     per = period / rig.dt
     text = f"the fastest motion of the declared model takes {period:.2g} s, {per:.0f} samples; " if period < 1e6 else ""
     text += f"a velocity changes by {100 * turn:.2g} % of its range from sample to sample"
-    mark = _mark(per < 10 or turn > 0.1, per < 5 or turn > 0.3)
-    hint = "" if mark == OK else "; sample faster, or look at the units of dt and of the parameters"
-    yield CheckResult(mark, "sampling", text + hint)
+    hint = "sample faster, or look at the units of dt and of the parameters"
+    yield _result("sampling", text, {hint: per < 5 or turn > 0.3}, {hint: per < 10 or turn > 0.1})
 
 
 def _noise(rig: Rig, model: StateSpaceModel, data: Dataset) -> Iterator[CheckResult]:
+    """Noise of the readings beside that which is declared, and beside their motion."""
     for i, name in enumerate(rig.measured):
         unit, signal = model.system.unit(name), np.asarray(data.y)[..., i]
-        seen, spread = reading_noise(signal), _std(signal)
-        declared = rig.noise_std.get(name)
-        noisy = max(seen, declared or 0.0) > 0.3 * spread
+        seen, codes, declared = reading_noise(signal), resolution(signal), rig.noise_std.get(name)
+        noisy = max(seen, declared or 0.0) > 0.3 * _std(signal)
         alone = name not in model.system.sensors  # of three axes one may sense nothing
-        drowned = "; the motion hardly rises above it: move or excite more, or look at the units" if noisy else ""
-        codes = resolution(signal)
-        steps = f"; it reads codes {codes:.2g} {unit} apart and repeats them, which is noise of {codes / 12**0.5:.2g}"
-        drowned += steps if codes else ""
-        if declared is None:
-            text = f"{name}: about {seen:.2g} {unit}, not declared, so it is estimated{drowned}"
-            yield CheckResult(_mark(noisy, noisy and alone), "noise", text)
-            continue
-        ratio = seen / declared
-        how = f"{name}: declared {declared:.2g} {unit}, the log's high frequencies show {seen:.2g} {unit}"
-        tame = "; the log was filtered, or less is true" if ratio < 0.1 else ""
-        wild = "; declare more, or leave it out to have it estimated" if ratio > 3 else ""
-        mark = _mark(tame or wild or noisy, (noisy and alone) or ratio > 30)
-        yield CheckResult(mark, "noise", how + tame + wild + drowned)
+        ratio, text = 1.0, f"about {seen:.2g} {unit}, not declared, so it is estimated"
+        if declared:
+            ratio = seen / declared
+            text = f"declared {declared:.2g} {unit}, the log's high frequencies show {seen:.2g} {unit}"
+        steps = f"it reads codes {codes:.2g} {unit} apart and repeats them, which is noise of {codes / 12**0.5:.2g}"
+        text = f"{name}: {text}; {steps}" if codes else f"{name}: {text}"
+        more = "declare more, or leave it out to have it estimated"
+        drowned = "the motion hardly rises above it: move or excite more, or look at the units"
+        tame = "the log was filtered, or less is true"
+        errors = {more: ratio > 30, drowned: noisy and alone}
+        yield _result("noise", text, errors, {tame: ratio < 0.1, more: ratio > 3, drowned: noisy})
 
 
 def rates(rig: Rig, data: Dataset) -> Iterator[CheckResult]:
     """Each rate against the derivative of its coordinate, where both are read."""
     for wrong, text in timings(rig, data):
-        yield CheckResult(_mark(wrong), "rate", text)
+        yield CheckResult(WARNING if wrong else OK, "rate", text)
 
 
 def torques(rig: Rig, system: AbstractSystem, data: Dataset, scales: Scales) -> Iterator[CheckResult]:
     """The inputs against gravity and inertia of the declared bodies."""
     mass, gravity = _loads_along(rig, system, data)
     needed = gravity + mass * scales.acceleration
-    servos = build_servos(rig)
     yield from drives(rig, system, data, needed, gravity)
     inputs = np.moveaxis(np.asarray(data.u), -1, 0)[: len(rig.input_columns)]
     for name, joint, gear, u in zip(rig.input_columns, rig.input_joints, system.gears, inputs, strict=True):
@@ -307,21 +292,32 @@ def torques(rig: Rig, system: AbstractSystem, data: Dataset, scales: Scales) -> 
         torque = abs(gear) * float(np.percentile(np.abs(u[data.valid]), 99))
         ratio = torque / needed[joint - 1]
         text = f"{name}: up to {torque:.3g} {unit}, gravity and inertia of joint {joint} need {needed[joint - 1]:.3g}"
-        odd = ratio > 30 or 0 < ratio < 1e-3
-        text += f"; look at its unit ({unit}) and at masses (kg) and lengths (m)" if odd else ""
-        yield CheckResult(_mark(odd, ratio > 100 or 0 < ratio < 3e-4), "torque", text)
-    for text in at_stops(rig, data):
-        yield CheckResult(WARNING, "range", text)
-    for text in sentences(identifiability(rig, system, servos)):
+        hint = f"look at its unit ({unit}) and at masses (kg) and lengths (m)"
+        odd, wrong = (ratio > most or 0 < ratio < least for most, least in ((30, 1e-3), (100, 3e-4)))
+        yield _result("torque", text, {hint: wrong}, {hint: odd})
+    yield from _at_stops(rig, data)
+    for text in sentences(identifiability(rig, system, build_servos(rig))):
         yield CheckResult(WARNING, "parameters", text)
-    kept = not_identifiable(rig, system, data)
-    if kept:
-        values = ", ".join(f"{name} = {rig.parameters[name]} {rig.unit(name)}" for name in kept)
+    if kept := not_identifiable(rig, system, data):
         text = (
             "nothing drives the machine, so that its motion does not determine the scale of its masses and friction: "
-            f"kept as declared is {values}, and all else is relative to that"
         )
-        yield CheckResult(_mark(True, False), "scale", text)
+        text += f"kept as declared is {', '.join(f'{name} = {rig.parameters[name]} {rig.unit(name)}' for name in kept)}"
+        yield CheckResult(WARNING, "scale", f"{text}, and all else is relative to that")
+
+
+def _at_stops(rig: Rig, data: Dataset) -> Iterator[CheckResult]:
+    """Measured joints whose readings touch an end of their range, where stops have no force in the model."""
+    machine = unpacked(rig.machine) if rig.machine else None
+    for joint, name in zip(machine.joints, machine.states, strict=False) if machine else ():
+        if joint.range is None or name not in rig.measured:
+            continue
+        y, (low, high) = np.asarray(data.y)[..., rig.measured.index(name)], joint.range
+        margin = 0.005 * (high - low)  # within which a reading counts as at its end
+        if count := int(np.sum((y < low + margin) | (y > high - margin))):
+            text = f"{name}: {counted(count, 'reading')} at or beyond its range of {low:.4g} to {high:.4g}"
+            text += f" {rig.unit(name)}; stops have no force in the model: leave those stretches out, or let diagnose"
+            yield CheckResult(WARNING, "range", f"{text} find hard_stop")
 
 
 def dynamics(rig: Rig, system: AbstractSystem, data: Dataset) -> Iterator[CheckResult]:
@@ -337,20 +333,18 @@ def dynamics(rig: Rig, system: AbstractSystem, data: Dataset) -> Iterator[CheckR
     if found := mistakes(explanations(rig, problem), plain):
         text = ", or just as well: ".join(one.text for one in found)
         text += f"; with that the declared bodies explain {explained(found[0].remains)} of the torque, by joint, "
-        yield CheckResult(
-            _mark(True, any(one.ruins for one in found)), "dynamics", f"{text}as it is {explained(plain)}"
-        )
+        mark = ERROR if any(one.ruins for one in found) else WARNING
+        yield CheckResult(mark, "dynamics", f"{text}as it is {explained(plain)}")
     elif np.all(plain < UNEXPLAINED):
         text = f"declared bodies and a static friction explain {explained(plain)} of the torque, by joint"
-        slopes = zip(rig.input_columns, gains(problem), strict=True)
-        kinds = enumerate(rig.kinds.items())
-        lags = {name: lag(problem, i) for i, (name, kind) in kinds if kind == TORQUE}
+        lags = {name: lag(problem, i) for i, (name, kind) in enumerate(rig.kinds.items()) if kind == TORQUE}
         late_by = {name: f", {when} rows late" for name, when in lags.items() if np.isfinite(when.std)}
+        slopes = zip(rig.input_columns, gains(problem), strict=True)
         text += "".join(f"; {name}: slope {slope:.3g}{late_by.get(name, '')}" for name, slope in slopes)
         yield CheckResult(OK, "dynamics", text)
-        yield from (
-            CheckResult(WARNING, "hold", f"{name}: {late(rig, when)}") for name, when in lags.items() if when.counts
-        )
+        for name, when in lags.items():
+            if when.counts:
+                yield CheckResult(WARNING, "hold", f"{name}: {late(rig, when)}")
 
 
 def late(rig: Rig, when: Lag) -> str:
@@ -382,19 +376,16 @@ def drives(
             continue
         limit, gear = float(servo.values.get("limit", np.inf)), abs(system.gears[i])
         weight, whole = gravity[joint - 1] / gear, needed[joint - 1] / gear
-        text = f"{name}: a {servo.kind} servo"
-        text += f", limited to {limit:.3g} {unit}; " if np.isfinite(limit) else "; "
-        text += f"gravity and inertia of joint {joint} need {whole:.3g}, gravity alone for {weight:.3g} {unit}"
-        low, delay = limit < 0.9 * weight, float(servo.values.get("delay", 0.0))
-        if low:
-            text += f": the limit is too low; write a higher one, or look at its unit ({unit}) and at masses (kg)"
-        if late := delay > 0.2 * length:
-            text += f"; a delay of {delay:.3g} s is much of a sequence of {length:.3g} s: write it in seconds"
-        yield CheckResult(_mark(low or limit < whole or late, limit < 0.5 * weight), "servo", text)
+        delay, limited = float(servo.values.get("delay", 0.0)), f", limited to {limit:.3g} {unit}"
+        text = f"{name}: a {servo.kind} servo{limited if np.isfinite(limit) else ''}; gravity and inertia of joint "
+        text += f"{joint} need {whole:.3g}, gravity alone for {weight:.3g} {unit}"
+        low = f"the limit is too low; write a higher one, or look at its unit ({unit}) and at masses (kg)"
+        long = f"a delay of {delay:.3g} s is much of a sequence of {length:.3g} s: write it in seconds"
+        warnings = {low: limit < 0.9 * weight, long: delay > 0.2 * length, "": limit < whole}
+        yield _result("servo", text, {low: limit < 0.5 * weight}, warnings)
         if not np.ptp(np.asarray(data.u)[..., i][data.valid]):
-            yield CheckResult(
-                WARNING, "servo", f"{name}: its command never changes, so that it shows no gain and no delay"
-            )
+            text = f"{name}: its command never changes, so that it shows no gain and no delay"
+            yield CheckResult(WARNING, "servo", text)
 
 
 def _stiff(rig: Rig, system: AbstractSystem, data: Dataset) -> Iterator[CheckResult]:
@@ -433,36 +424,33 @@ def _loads(system: AbstractSystem, q: Float[Array, "pose dof"]) -> tuple[Array, 
 
 def _motion(rig: Rig, model: StateSpaceModel, data: Dataset, along: Along) -> Iterator[CheckResult]:
     """Velocities that each joint visits: range, both directions, passages through rest."""
-    dof = len(model.system.coordinates)
-    for joint in range(dof):
-        name, unit = model.system.rates[joint], model.system.unit(model.system.rates[joint])
+    for joint, name in enumerate(model.system.rates):
+        unit = model.system.unit(name)
         v, seen = _velocity(rig, model, data, along, joint)
         inner = v[np.isfinite(v)]
         if not inner.size:
-            yield CheckResult(ERROR, "motion", f"joint {joint + 1}{seen}: no velocity, as no sequence can be followed")
+            text = f"joint {joint + 1}{seen}: no velocity, as no sequence can be followed"
+            yield CheckResult(ERROR, "motion", text)
             continue
         low, high = np.percentile(inner, [1, 99])
         top = max(-low, high)
-        noise = rig.noise_std.get(name, 0.0) if name in rig.measured else 0.0
-        if top <= 3 * noise or top < 1e-9:
-            yield CheckResult(
-                ERROR, "motion", f"joint {joint + 1} hardly moves ({top:.2g} {unit}); drive it through its range"
-            )
+        if top <= max(3 * rig.noise_std.get(name, 0.0), 1e-9):
+            text = f"joint {joint + 1} hardly moves ({top:.2g} {unit}); drive it through its range"
+            yield CheckResult(ERROR, "motion", text)
             continue
         near_rest = float(np.mean(np.abs(inner) < 0.05 * top))
-        bands = np.histogram(inner, np.linspace(-top, top, 21))[0]
-        covered = float(np.mean(bands >= 5))
-        turns = int(sum(_turns(row, 0.05 * top) for row in v))
+        covered = float(np.mean(np.histogram(inner, np.linspace(-top, top, 21))[0] >= 5))
+        turns = sum(np.count_nonzero(np.diff(np.sign(row[np.abs(row) > 0.05 * top]))) for row in v)  # but for noise
         text = f"joint {joint + 1}{seen}: {low:.3g} to {high:.3g} {unit}, {100 * covered:.0f} % of that range covered, "
         text += f"{100 * near_rest:.0f} % of the time near rest, {turns} changes of direction"
-        hints = [
-            (min(-low, high) < 0.2 * top, "it moves in one direction only: friction in the other stays unknown"),
-            (turns < 4, "too few turns to identify Coulomb friction"),
-            (near_rest > 0.5, "it rests most of the time: move more, and slowly through zero velocity"),
-            (covered < 0.5, "many velocities are never visited: the curve is a guess there"),
-        ]
-        remarks = [hint for holds, hint in hints if holds]
-        yield CheckResult(_mark(remarks and rig.friction), "motion", "; ".join([text, *remarks]))
+        hints = {
+            "it moves in one direction only: friction in the other stays unknown": min(-low, high) < 0.2 * top,
+            "too few turns to identify Coulomb friction": turns < 4,
+            "it rests most of the time: move more, and slowly through zero velocity": near_rest > 0.5,
+            "many velocities are never visited: the curve is a guess there": covered < 0.5,
+        }
+        result = _result("motion", text, {}, hints)
+        yield result if rig.friction else result._replace(mark=OK)
 
 
 def _velocity(
@@ -479,12 +467,6 @@ def _velocity(
             return v, ""
     x = along.x[..., len(model.system.coordinates) + joint]
     return np.where(np.isfinite(x), x, np.nan), " (never seen, by the declared model)"
-
-
-def _turns(v: Float[np.ndarray, " time"], dead: float) -> int:
-    """Changes of direction, noise near rest left out."""
-    sign = np.sign(v[np.abs(v) > dead])
-    return int(np.count_nonzero(np.diff(sign)))
 
 
 def _observability(
@@ -506,24 +488,21 @@ def _observability(
             gram = gramian(along.transition[i, :last], along.reading[i, :last] / noise[:, None], scale)
             grams += [gram] if np.isfinite(gram).all() else []
     if not grams:
-        yield CheckResult(
-            ERROR, "states", "the declared model cannot follow the logs; look at units, signs and parameters"
-        )
+        text = "the declared model cannot follow the logs; look at units, signs and parameters"
+        yield CheckResult(ERROR, "states", text)
         return
     values = np.median([np.linalg.eigvalsh(gram) for gram in grams], axis=0)
     known = np.median([undetermined(gram) for gram in grams], axis=0)
-    rank = int(np.sum(values > 1))
     condition = np.log10(values[-1] / max(values[0], 1e-300 * values[-1]))
     dark = [name for name, share in zip(names, known, strict=True) if share > 0.5]
     weak = [name for name, share in zip(names, known, strict=True) if 0.2 < share <= 0.5]
-    spoilt = any(name in names[dof:] for name in dark)
-    text = f"{rows * model.dt:.3g} s of readings determine {rank} of {len(names)} directions of the state"
-    text += f" (condition 1e{condition:.0f})"
-    text += f"; not determined: {', '.join(dark)}" if dark else ""
-    text += f"; hardly determined: {', '.join(weak)}" if weak else ""
     shown = "move so that the hidden joint shakes the rest" if dof else "change the inputs so that it shows"
-    text += f": measure more of the state, or {shown}" if spoilt else ""
-    yield CheckResult(_mark(dark or weak, spoilt), "states", text)
+    spoilt = any(name in names[dof:] for name in dark)
+    text = f"{rows * model.dt:.3g} s of readings determine {np.sum(values > 1)} of {len(names)} directions of the state"
+    hidden = f"not determined: {', '.join(dark)}"
+    warnings = {hidden: dark and not spoilt, f"hardly determined: {', '.join(weak)}": weak}
+    errors = {f"{hidden}: measure more of the state, or {shown}": spoilt}
+    yield _result("states", f"{text} (condition 1e{condition:.0f})", errors, warnings)
 
 
 def undetermined(gram: Float[np.ndarray, "state state"]) -> Float[np.ndarray, " state"]:

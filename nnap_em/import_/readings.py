@@ -8,7 +8,7 @@ import numpy as np
 from ..data.counters import Counter, counter, unwrapped
 from ..data.held import hold, repeats
 from ..data.rig import Rig
-from ..data.spikes import spikes
+from ..data.rough import spikes
 from ..numerics.digits import counted
 from .signals import Signal
 
@@ -45,9 +45,9 @@ def as_taken(
 
 def _jumps(s: Signal, angle: bool, rate: bool) -> Counter | None:
     """The jumps of a signal; where spikes hide them, those of the others."""
-    found = counter(s.y, s.t, angle=angle, rate=rate)
+    found = counter(s.y, angle=angle, rate=rate)
     if found is None and np.max(np.abs(np.diff(s.y))) > 0.2 * np.ptp(s.y):
         others = s.y.copy()
         others[spikes(s.y)] = np.nan
-        found = counter(others, s.t, angle=angle, rate=rate)
+        found = counter(others, angle=angle, rate=rate)
     return found

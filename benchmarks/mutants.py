@@ -707,9 +707,9 @@ a spring written with the other sign
 + float(law.slope)
 # export/urdf.py
 ## test_written_back.py::test_a_urdf_file_is_written_again_with_the_numbers_of_the_fit[whole]
-a link of a URDF file with the change of its body alone
+half of a body's change written to its link of a URDF file
 - own += change
-+ own = change
++ own += 0.5 * change
 # export/friction.py
 ## test_written_back.py::test_coulomb_and_viscous_friction_are_read_off_a_curve
 friction written back with the other sign

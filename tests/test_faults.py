@@ -208,7 +208,7 @@ def _diagnosed(rig: Path, out: Path, *more: str, kind: signal.Signals | None = N
     if kind:
         assert run.poll() is None, "it was over too soon"
         run.send_signal(kind)
-    _, said = run.communicate(timeout=300)
+    _, said = run.communicate(timeout=600)  # it compiles, on a machine that may be busy
     return run.returncode, said
 
 

@@ -861,9 +861,9 @@ the worst start of a law
 - return max(begun, key
 + return min(begun, key
 ## test_loop.py::test_a_spring_is_named_and_sized
-no law is refitted
-- if not foreseen(trial.foreseen,
-+ if foreseen(trial.foreseen,
+what a refit leaves counts as what it removes
+- removed=1 - loss.ratio(null.end, end
++ removed=loss.ratio(null.end, end
 # diagnosis/rounds.py
 ## test_search.py::test_a_round[another start]
 a law from one start

@@ -316,7 +316,7 @@ def test_what_scales_with_the_gain_and_what_friction_does_is_said(tmp_path):
 
 
 REMARKS = {  # numbers of a servo whose joint needs 2 N m, 1 of them for its weight, in sequences of 2 s
-    "a limit below the weight": ("limit = 0.4", ERROR, "limited to 0.4 N m.*: the limit is too low; write a"),
+    "a limit below the weight": ("limit = 0.4", ERROR, "limited to 0.4 N m.*; the limit is too low; write a"),
     "a limit above all": ("limit = 30.0", OK, "a position servo, limited to 30 N m"),
     "a long delay": ("delay = 1.0", WARNING, "a delay of 1 s is much of a sequence of 2 s: write it in seconds"),
 }

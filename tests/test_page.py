@@ -4,11 +4,15 @@ import re
 from html.parser import HTMLParser
 
 import pytest
+from helpers import begun
+from rigs import slide_logs, slide_rig
 
+from nnap_em.data.logs import logs_of_arrays
 from nnap_em.diagnosis.keys import words
 from nnap_em.diagnosis.statistics import FAILS
 from nnap_em.effects import catalogue
 from nnap_em.numerics.digits import counted, number, with_std
+from nnap_em.report.document import predictions
 from nnap_em.report.html import Picture, write_report
 from nnap_em.report.page import page
 from nnap_em.report.wording import label, p_value, reached
@@ -102,6 +106,19 @@ class _Balance(HTMLParser):
 
 def _text(document, *pictures) -> str:
     return _Balance(page(document, pictures)).text
+
+
+def test_a_page_says_where_no_test_sequence_reaches_a_prediction():
+    short = WHOLE["error"] | {"reach_s": -0.05}
+    said = "Predictions start after 1.0 s, and no test sequence is longer: record some that are."
+    assert said in _text(WHOLE | {"error": short}) and said not in _text(WHOLE)
+
+
+def test_predictions_stand_in_the_order_of_their_models():
+    """A figure has the first in vermilion, the last in blue."""
+    rig, data = slide_rig(), slide_logs(0)
+    fitted, logs = begun(rig, data), logs_of_arrays(data, rig)
+    assert [*predictions({"before": fitted, "after": fitted}, logs, logs, 0)] == ["before", "after"]
 
 
 @pytest.mark.parametrize("document", REPORTS.values(), ids=REPORTS)

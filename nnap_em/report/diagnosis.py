@@ -27,6 +27,7 @@ from .html import Picture, picture, write_report
 from .page import page
 from .residual_plots import innovation_figure, residual_figure
 from .tables import visited_nodes, write_friction
+from .wording import reached
 
 
 @stage("report")
@@ -111,7 +112,7 @@ def _error_pictures(
     """Pictures of prediction errors, of the learned friction, and of the prediction of the longest test sequence."""
     alone = lambda sides: sides if "after" in sides else {"fit": sides["before"]}  # noqa: E731
     out = []
-    if error and test:
+    if error and test and reached(error):
         caption = "On test sequences that no fit and no choice has seen."
         both = {name: error[name] for name in predicted}
         figure = error_figure({name: error[name] for name in ("horizons_s", "reach_s")} | alone(both), names)
@@ -120,7 +121,7 @@ def _error_pictures(
         caption = "A missing effect bends the friction that is learned without it." if len(tables) > 1 else ""
         figure = friction_figure(alone(tables), names, title="Learned friction")
         out.append(picture("error", "Learned friction", caption, figure))
-    if error and test:
+    if error and test and reached(error):
         longest, given = int(np.argmax(np.sum(np.asarray(test.data.valid), axis=1))), error["given_s"]
         caption = f"The longest one ({test.files[longest]}), predicted from its first {given:g} s."
         figure = prediction_figure(alone(predicted), test.data, names, given, longest)

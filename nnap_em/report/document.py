@@ -108,7 +108,8 @@ def predictions(sides: Mapping[str, Identified], train: Logs, test: Logs, seed: 
     key, rows, longer = jax.random.key(seed), test.data.t.shape[1], train.data.t.shape[1]
     data = stepped(test.data, longer if longer <= 8 * rows else 0)
     every = {name: predict(fitted, data, given_of(fitted), key=key) for name, fitted in sides.items()}
-    return jax.device_put(jax.tree.map(lambda a: np.asarray(a)[:, :rows], every))
+    out = jax.device_put(jax.tree.map(lambda a: np.asarray(a)[:, :rows], every))
+    return {name: out[name] for name in sides}  # JAX sorts names
 
 
 def errors(predicted: Mapping[str, Prediction], sides: Mapping[str, Identified], test: Logs) -> dict[str, Any]:

@@ -65,7 +65,7 @@ def write_identification(
     figures += [picture("found", f"Unknown term {term['name']}", caption, term_figure(term)) for term in drawn]
     sides = {"fit": fitted}
     error = errors(predictions(sides, train, test, seed), sides, test) if test else None
-    if error:
+    if error and reached(error):
         caption = "On test sequences that the fit has not seen."
         figures.append(picture("error", "Prediction error", caption, error_figure(error, names)))
     misfit, causes, far = fitted.misfit, [], moved(fitted.rig, fitted.m_step.prior, fitted.model)

@@ -149,6 +149,9 @@ def _errors(document: _Entry) -> list[Part]:
             for i, horizon in enumerate(horizons)
         ]
         out.append(Table(head, rows))
+    elif before and finite(error.get("given_s")):
+        given = number(error["given_s"], 2)
+        out.append(f"Predictions start after {given} s, and no test sequence is longer: record some that are.")
     tests = document.get("tests") or {}
     if tests.get("before"):
         out.append(_failures(tests["before"], tests.get("after")))

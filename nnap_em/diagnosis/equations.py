@@ -318,7 +318,7 @@ def _passes(case: Case) -> bool:
 
 def _certain(case: Case) -> bool:
     """True where every strength is determined beside its level and share; parts left out confirm that it is there."""
-    spreads = covariances(case.of.model, cast(Any, case.of), simulated.precision(case.of))[-len(case.laws) :]
+    spreads = covariances(case.of.model, case.of, simulated.precision(case.of))[-len(case.laws) :]
     return all(certainty(*each) >= DETERMINED for each in zip(case.laws, case.effects, spreads, strict=True))
 
 

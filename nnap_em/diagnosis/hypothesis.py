@@ -1,7 +1,7 @@
 """A model with what was added to it: every addition is one record of law, prior and evidence."""
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -94,16 +94,16 @@ class Hypothesis(NamedTuple):
         return self._replace(model=model)
 
 
-def blocks(model: StateSpaceModel, m_step: ScoringMStep) -> list[slice]:
-    """Slice of the parameters of every effect among all that are estimated."""
+def blocks(model: StateSpaceModel, of: Any) -> list[slice]:
+    """Slice of the parameters of every effect among all that are estimated, whose prior `of` has."""
     sizes = [flat(effect).size for effect in model.effects]
-    ends = np.cumsum(sizes) + m_step.prior.size - sum(sizes)
+    ends = np.cumsum(sizes) + of.prior.size - sum(sizes)
     return [slice(int(end - size), int(end)) for end, size in zip(ends, sizes, strict=True)]
 
 
-def covariances(model: StateSpaceModel, m_step: ScoringMStep, hessian) -> list[Float[np.ndarray, "param param"]]:
-    """Covariance of the parameters of every effect, all else integrated out (Laplace)."""
-    cov, prior = np.linalg.inv(np.asarray(hessian)), m_step.prior
+def covariances(model: StateSpaceModel, of: Any, hessian) -> list[Float[np.ndarray, "param param"]]:
+    """Covariance of the parameters of every effect, all else integrated out (Laplace); `of` has their prior."""
+    cov, prior = np.linalg.inv(np.asarray(hessian)), of.prior
     cut, std = cov.shape[0] - prior.size, np.asarray(prior.std)
     cov = cov[cut:, cut:] * np.outer(std, std)
-    return [cov[block, block] for block in blocks(model, m_step)]
+    return [cov[block, block] for block in blocks(model, of)]

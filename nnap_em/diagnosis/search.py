@@ -143,7 +143,7 @@ def _determined(
     return hypothesis, None, steps
 
 
-def doubtful(sure: Sequence[float], recordings: float) -> int | None:
+def doubtful(sure: Sequence[float], recordings: int | float) -> int | None:
     """Place of the law of the least Wald statistic, where that of its stated values shows no law.
 
     The search counts rows by their likelihood, which is surer than recordings agree; of few, the standard deviation is

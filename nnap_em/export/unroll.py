@@ -147,8 +147,8 @@ class _Writer:
         key = (op.c, *((type(value), repr(value)) for value in values))  # NaN is not itself, its text is
         return self.lines.setdefault(key, Line(f"t{len(self.lines)}", op, values, whole)).name
 
-    def each(self, op: Op, whole: bool, *operands: Any) -> np.ndarray:
-        """An operation on arrays, entry by entry."""
+    def each(self, op: Op, whole: bool, *operands: Any) -> Any:
+        """An operation on arrays, entry by entry; of single operands the one entry."""
         return np.frompyfunc(lambda *values: self.write(op, whole, *values), len(operands), 1)(*operands)
 
     def run(self, jaxpr: Any, arguments: Sequence[np.ndarray]) -> list[np.ndarray]:

@@ -93,7 +93,7 @@ def write_diagnosis(
         "noise": {name: noise(fitted) for name, fitted in both.items()},
         "rounds": [_round(step, diagnosis.before.rig.dt) for step in diagnosis.steps],
         "undecided": [place_of(key) for key in rivals],
-        "suspects": suspects,
+        "suspects": [suspect._asdict() for suspect in suspects],
         "next": [*advice(accepted, rivals, suspects), *designed],
     }
     write_report(out, "report", document, page(document, figures), diagnosis.before.rig.named)

@@ -147,9 +147,10 @@ class _Writer:
         key = (op.c, *((type(value), repr(value)) for value in values))  # NaN is not itself, its text is
         return self.lines.setdefault(key, Line(f"t{len(self.lines)}", op, values, whole)).name
 
-    def each(self, op: Op, whole: bool, *operands: Any) -> Any:
-        """An operation on arrays, entry by entry; of single operands the one entry."""
-        return np.frompyfunc(lambda *values: self.write(op, whole, *values), len(operands), 1)(*operands)
+    def each(self, op: Op, whole: bool, *operands: Any) -> np.ndarray:
+        """An operation on arrays, entry by entry."""
+        every = np.frompyfunc(lambda *values: self.write(op, whole, *values), len(operands), 1)
+        return np.asarray(every(*operands), object)
 
     def run(self, jaxpr: Any, arguments: Sequence[np.ndarray]) -> list[np.ndarray]:
         """The results of a jaxpr on arrays of names and numbers."""
@@ -212,7 +213,8 @@ class _Writer:
     def reduced(self, op: Op, whole: bool, operand: np.ndarray, axes: Sequence[int]) -> np.ndarray:
         """Entries along axes joined by an operation."""
         for axis in sorted(axes, reverse=True):
-            operand = functools.reduce(lambda a, b: self.each(op, whole, a, b), np.moveaxis(operand, axis, 0))
+            joined = functools.reduce(lambda a, b: self.each(op, whole, a, b), np.moveaxis(operand, axis, 0))
+            operand = np.asarray(joined, object)
         return operand
 
     def dot(self, a: np.ndarray, b: np.ndarray, numbers: Any, whole: bool) -> np.ndarray:

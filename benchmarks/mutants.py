@@ -399,7 +399,7 @@ forces unsaid that move no state
 # diagnosis/hypothesis.py
 ## test_search.py::test_certainty_is_the_marginal_of_the_posterior
 parameters of an effect looked for among those of the machine
-- np.cumsum(sizes) + m_step.prior.size - sum(sizes)
+- np.cumsum(sizes) + of.prior.size - sum(sizes)
 + np.cumsum(sizes)
 ## test_search.py::test_one_of_three_effects_goes_with_its_prior_and_its_reason
 the next effect dropped

@@ -31,7 +31,7 @@ class _Viscous(eqx.Module):
 
 
 def _rig(kind: str, model: StateSpaceModel) -> Rig:
-    """What the owner of `model` declares: its physics; friction, start and noises are unknown."""
+    """The declaration of the physics of `model`; its friction, start and noises are unknown."""
     return dataclasses.replace(declared(kind, model), noise_std={}, start={})
 
 

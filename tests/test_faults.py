@@ -297,7 +297,7 @@ DAMAGED = {
     "text": lambda content: b"time,u\n0,1\n",
     "a bit": _flipped,
 }
-"""What happens to a finished step."""
+"""Damages of a finished step."""
 
 
 def test_a_step_that_is_damaged_or_of_another_version_is_done_again(tmp_path, monkeypatch):

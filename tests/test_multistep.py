@@ -353,7 +353,7 @@ def test_a_function_of_many_weights_is_a_force_held_over_the_step(bench, around,
     seq, at = jax.tree.map(lambda a: a[0, :20], (data, path))
 
     def error(dt: float) -> float:
-        """What the force's change within the step leaves, relative: of order dt^2."""
+        """Relative error by the change of the force within the step, of order dt^2."""
 
         def slopes(held: bool):
             monkeypatch.setattr(catalogue["unknown_function"], "held", held)

@@ -515,8 +515,8 @@ def test_a_named_law_gives_way_to_a_remainder_that_explains_the_larger_part():
 
 
 def test_a_search_begins_at_the_whole_length_unless_most_sequences_are_lost_there():
-    """Where a joint is hidden and readings are white, at the two shortest horizons of at most 150 rows, then in the
-    middle; the whole comes of itself.
+    """A search of white readings with a hidden joint begins at the two shortest horizons of at most 150 rows and one in
+    the middle; the whole length follows.
     """
     every, most, few = np.ones(6, bool), np.arange(6) < 3, np.arange(6) < 2
     for short, whole, first in ((every, most, 9), (every, few, 4), (few, few, 4)):

@@ -1,6 +1,7 @@
 """Formats of drives, PLCs and tools: the numbers that were written come back on the grid, or a line says what helps."""
 
 import functools
+import itertools
 import re
 from datetime import UTC, datetime, timedelta
 
@@ -223,7 +224,8 @@ MOMENTS = {  # the header, and the texts of a time [s] on 3 November 2026, from 
 }
 
 
-MOMENTS = {name: (*moment, *marks) for (name, moment), marks in zip(MOMENTS.items(), 5 * (",.", ";,"), strict=False)}
+MARKED = zip(MOMENTS.items(), itertools.cycle((",.", ";,")), strict=False)
+MOMENTS = {name: (*moment, *marks) for (name, moment), marks in MARKED}
 
 
 @pytest.mark.parametrize("header, text, separator, decimal", MOMENTS.values(), ids=MOMENTS)

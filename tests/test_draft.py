@@ -129,6 +129,13 @@ def test_a_system_that_cannot_be_told_is_asked_for(tmp_path, names, reason):
         _draft(tmp_path, *names)
 
 
+def test_a_log_of_another_layout_is_to_be_imported(tmp_path, capsys):
+    log = tmp_path / "german.csv"
+    log.write_text("time;u;x\n" + "".join(f"{i / 100:g};1;2\n" for i in range(20)))
+    assert cli.main(["init", str(log), "--out", str(tmp_path / "rig")]) == 0
+    assert "the log has other marks, lines or clocks: then nnap-em import" in capsys.readouterr().err
+
+
 def test_the_command_writes_once_and_never_over(tmp_path, capsys):
     write_csv(tmp_path / "bench/train/01.csv", _log("u", "x_mm"))
     argv = ["init", str(tmp_path / "bench/train/01.csv")]

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from helpers import chain_rig
 
-from nnap_em.data.dataset import pad
+from nnap_em.data.dataset import DataError, pad
 from nnap_em.data.rig import read_rig
 from nnap_em.diagnosis import equations
 from nnap_em.diagnosis.equations import FOLDS, Case, folds, search_equations
@@ -274,3 +274,6 @@ def test_a_draft_of_equations_needs_only_the_rates(tmp_path):
     (tmp_path / "rig.toml").write_text(text)
     rig = read_rig(tmp_path / "rig.toml", specs)
     assert (rig.input_columns, rig.measured, rig.dt) == (("pump",), ("level",), 0.5)
+    (tmp_path / "log.csv").write_text("time\n0\n1\n2\n")
+    with pytest.raises(DataError, match=r"log.csv: holds no column beside the time; give a log with inputs"):
+        draft_equations(tmp_path / "log.csv")

@@ -173,6 +173,7 @@ RISES = [
     ([*WHOLE, -90.0, 5.0], {}, 0.0),
     ([*WHOLE, 5.0, 6.9], {"ess": 100.0}, 0.0),  # by chance, of a sample
     ([*WHOLE, 5.0, 7.1], {"ess": 100.0}, 1.1),
+    ([*WHOLE, 5.0, loop.DIVERGED, 7.1], {"ess": 100.0}, 1.1),  # a refused step says nothing of chance
     (WHOLE, {}, np.inf),
     (WHOLE[1:], {"epoch": 4}, np.inf),
     ([*WHOLE[1:], 6.0], {"epoch": 5}, 0.0),  # begun from another fit, whose first epoch counts

@@ -454,7 +454,9 @@ def test_what_weighs_nothing_changes_nothing(tmp_path, capfd):
         ARM.replace(MASS, mesh + MASS, 1).replace("</joint>", shut + "</joint>", 1).replace("continuous", "revolute", 1)
     )
     (tmp_path / "plain.urdf").write_text(_urdf(ARM))
-    (tmp_path / "framed.urdf").write_text(_urdf(framed + links + "".join(_turning(*f, kind="fixed") for f in frames)))
+    (tmp_path / "framed.urdf").write_text(
+        _urdf(framed + links + "".join(_turning(*f, kind="fixed") for f in frames) + "<gazebo><p>${x}</p></gazebo>")
+    )
     bare, full = (read_machine(tmp_path / f"{name}.urdf") for name in ("plain", "framed"))
     assert full.joints == bare.joints and "".join(capfd.readouterr()) == ""
     assert [body.name for body in full.bodies] == [body.name for body in bare.bodies]

@@ -36,7 +36,9 @@ def test_the_first_model_of_a_measured_arm_follows_its_readings(shared):
 
 @pytest.mark.slow  # fast: test_the_first_model_of_a_measured_arm_follows_its_readings
 def test_every_shared_rig_has_a_finite_first_step(shared):
-    for path in data_sets(shared):
+    paths = data_sets(shared)
+    assert paths
+    for path in paths:
         model, rule, smoother, data = _problem(path.parent)
         after, info, loglik, _, states = em_step(model, data, smoother, rule, jax.random.key(1))
         assert info.used.any(), path

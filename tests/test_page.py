@@ -114,6 +114,11 @@ def test_a_page_says_where_no_test_sequence_reaches_a_prediction():
     assert said in _text(WHOLE | {"error": short}) and said not in _text(WHOLE)
 
 
+def test_a_round_that_scored_nothing_is_on_the_page():
+    nothing = {"horizon_s": 5.0, "screened": [], "refitted": [], "accepted": None}
+    assert "Over 5.00 s: added nothing No candidate was scored." in _text(WHOLE | {"rounds": [nothing]})
+
+
 def test_predictions_stand_in_the_order_of_their_models():
     """A figure has the first in vermilion, the last in blue."""
     rig, data = slide_rig(), slide_logs(0)

@@ -249,8 +249,8 @@ def _run(entries, errors=None, hypothesis=BARE, shortlist=8, steps=None, p=None,
 GAIN, ZONE, DRAG, HOOKE, FREE = "motor_gain", "dead_zone", "air_drag", "torsional_spring", "unknown_function"
 SPRUNG = {"hypothesis": BARE.plus(SPRING, _candidate(SPRING))}
 OVERSHOT = _gain(0.76, value=2.0, folds=(0.9, 0.9, -0.2))  # a ripple of nine periods, which one part contradicts
-MANY = ("motor_gain", "dead_zone", "air_drag", "viscous_change", "stiction", "torque_offset", "motor_back_emf")
-MANY = [_law(name) for name in MANY if name in catalogue and len(catalogue[name].units) == 1]
+MANY = ("motor_gain", "dead_zone", "air_drag", "viscous_change", "torque_offset", "motor_back_emf")
+MANY = [_law(name) for name in MANY]
 ROUNDS = {  # what the screen says, options, the laws that are refitted in turn, and the one that is accepted
     "a law over the floor": ([_gain(0.151)], {}, [GAIN], GAIN),
     "a law below the floor": ([_gain(0.149)], {}, [], None),

@@ -24,7 +24,7 @@ def _run(*command: object, cwd: Path, **env: str) -> str:
     return done.stdout
 
 
-@pytest.mark.slow
+@pytest.mark.slow  # fast: none, it builds the package
 def test_the_wheel_holds_the_package_and_runs_elsewhere(tmp_path):
     """Built from the source archive, in an environment that sees the packages of this one, not the checkout."""
     build = (sys.executable, "-m", "hatchling", "build", "-d", tmp_path)

@@ -108,11 +108,10 @@ def _physics(model: mujoco.MjModel, q: np.ndarray, v: np.ndarray) -> tuple[np.nd
     return mass, data.qfrc_bias - data.qfrc_spring
 
 
-def _of_file(folder: Path, file: str, more: str, effects=()) -> tuple[Machine, Identified]:
+def _of_file(folder: Path, file: str, more: str, effects=(), change=("", "")) -> tuple[Machine, Identified]:
     """A machine of `machines/`, and a fit of it before its first epoch, its first joint read and driven."""
-    path = Path(__file__).parent / "machines" / file
-    machine = read_machine(path)
-    (folder / file).write_text(path.read_text())
+    (folder / file).write_text((Path(__file__).parent / "machines" / file).read_text().replace(*change))
+    machine = read_machine(folder / file)
     text = file_rig(file, [machine.joints[0].name], more, friction="none")
     (folder / "rig.toml").write_text(text)
     rig, t = read_rig(folder / "rig.toml", specs), 0.01 * np.arange(30.0)
@@ -190,6 +189,13 @@ def test_a_link_that_would_weigh_less_than_nothing_is_named(tmp_path):
     assert write_urdf(fitted, tmp_path / "out.urdf") == [
         "the numbers of forearm: links on its fixed joints alone have more"
     ]
+
+
+def test_a_planar_joint_is_three_whose_friction_is_left_out(tmp_path):
+    _, fitted = _of_file(tmp_path, "arm.urdf", INPUT, change=('"reach" type="prismatic"', '"reach" type="planar"'))
+    left = write_urdf(fitted, tmp_path / "out.urdf")
+    three = [name for name in fitted.model.system.coordinates if name.startswith("reach")]
+    assert len(three) == 3 and left == [f"friction and limit of {name}, which is no joint of its own" for name in three]
 
 
 OWNED = """<mujoco model="owned">

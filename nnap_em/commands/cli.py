@@ -218,12 +218,13 @@ def _stoppable(log: Log) -> Iterator[Log]:
 
 
 def _line(error: Exception) -> str | None:
-    """The one line for a mistake of the caller or of the machine; None for one of ours."""
+    """The message of a mistake of the caller or of the machine; None for one of ours."""
     from . import common
 
     if isinstance(error, OSError):
         return f"{error.filename}: {error.strerror}" if error.filename else str(error.strerror or error)
-    return " ".join(str(error).split()) if isinstance(error, common.MISTAKES) else None
+    lines = [" ".join(line.split()) for line in str(error).splitlines()]  # several mistakes of a rig.toml, a line each
+    return "\n".join(lines) if isinstance(error, common.MISTAKES) else None
 
 
 def _warn(message: Warning | str, category: type[Warning], *_) -> None:

@@ -72,7 +72,7 @@ def set_up() -> None:
             return
         jax.config.update("jax_compilation_cache_dir", str(folder))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)  # many small programs
-    elif "JAX_COMPILATION_CACHE_DIR" not in os.environ:  # it was set in this process, not for commands
+    elif not folder or "JAX_COMPILATION_CACHE_DIR" not in os.environ:  # none, or set in this process, not for commands
         return
     use_cache(Path(folder) / "traced")
 

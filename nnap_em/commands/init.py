@@ -16,6 +16,7 @@ import argparse
 from pathlib import Path
 
 from ..data.dataset import DataError
+from ..import_.text_file import plain_csv
 from ..init.draft import draft
 from ..init.equations import draft_equations
 from ..init.from_machine import draft_machine
@@ -37,7 +38,8 @@ def run(args: argparse.Namespace, log: Log) -> None:
     else:
         drafted = draft(args.log, args.system, specs)
     replace_text(path, drafted.text)
-    if drafted.mapped:
-        log(f"the log has other names or units: then nnap-em import {args.log} --rig {path} --out FOLDER")
+    if drafted.mapped or not (args.log.suffix.lower() in (".parquet", ".mat") or plain_csv(args.log)):
+        other = "names or units" if drafted.mapped else "marks, lines or clocks"
+        log(f"the log has other {other}: then nnap-em import {args.log} --rig {path} --out FOLDER")
     missing = "; ".join(f"[{table}] {', '.join(keys)}" for table, keys in drafted.missing.items())
     log(f"wrote {path}" + (f"; fill in {missing}" if missing else ""))

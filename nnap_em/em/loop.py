@@ -48,7 +48,7 @@ class EMState(NamedTuple):
     """Share of the way to `proposal` that is tried."""
     key: PRNGKeyArray
     loglik: Float[np.ndarray, " epoch"]
-    """Mean log-likelihood of the sequences used, of every epoch so far; -1e6 where all diverged."""
+    """Mean log-likelihood of the sequences used, of every epoch so far; `DIVERGED` where all diverged."""
     ess: float
     """Mean effective sample size of the last epoch; infinite where nothing is sampled."""
     stage: int = 0
@@ -206,6 +206,8 @@ WIDENED, SMOOTHED, SEARCHED = range(1 << 30, (1 << 30) + 3)
 """Numbers folded into the key of a fit for draws after it, of its covariance, states, a later search."""
 EPOCHS = 40
 """Epochs of a fit at most."""
+DIVERGED = -1e6
+"""Log-likelihood of an epoch or a sequence without one [nat]."""
 REST = 0.05
 """Change of the log-likelihood, twice running, at which EM is at rest [nat a sequence]."""
 
@@ -262,8 +264,9 @@ def fit(
         same: Callable[[], float] = lambda: -math.inf  # noqa: E731
         if kept is not None and used.any():
             same = functools.partial(_rise, state, kept, data, rule, used)
+        if used.any():
+            state = state._replace(ess=float(np.mean(np.asarray(ess)[used])))
         used = used if used.any() else followed  # where all are lost the step was too long
-        state = state._replace(ess=float(np.mean(np.asarray(ess)[used])))
         tried, state = state.model, _judge(state, proposal, info.hessian, np.asarray(loglik), used, same)
         kept = path if seen == longest and state.best is tried else kept
         watch(state, seen, used)
@@ -287,7 +290,8 @@ def unsettled(state: EMState, schedule: Schedule, longest: int) -> float:
     Infinite where fewer than three epochs saw whole sequences. A sampled likelihood rises by more than it ever fell.
     """
     epochs = range(state.epoch - len(state.loglik), state.epoch)  # a fit begun from another starts at 1
-    whole = [v for epoch, v in zip(epochs, state.loglik, strict=True) if schedule.horizon(epoch, longest) == longest]
+    every = [(schedule.horizon(epoch, longest), v) for epoch, v in zip(epochs, state.loglik, strict=True)]
+    whole = [v for seen, v in every if seen == longest and v > DIVERGED]  # a refused step is none
     if len(whole) < 3:
         return math.inf
     # Least rise of the log-likelihood over two epochs by which EM is not at rest [nat a sequence]
@@ -320,7 +324,7 @@ def _judge(
     along its own path may rise along the `same` path.  A sequence that was left out under the best model does not
     count; one that diverges under the new model counts against it.
     """
-    loglik = np.nan_to_num(loglik, nan=-1e6, neginf=-1e6)
+    loglik = np.nan_to_num(loglik, nan=DIVERGED, neginf=DIVERGED)
     mean = float(np.mean(loglik[used]))
     if (rises := bool(np.nanmean(loglik - state.top) >= -0.5)) or same() > 0:
         top = np.where(used, loglik, np.nan)

@@ -174,6 +174,8 @@ class _Writer:
         for inner in ("jaxpr", "call_jaxpr", "fun_jaxpr"):
             if inner in params:
                 return self.run(params[inner], operands)
+        if name == "named":
+            return [self.each(Op(f"{params['function']}({{}})", params["value"], own=True), whole, *operands)]
         if not any(map(_symbolic, operands)):
             return _by_jax(equation, operands)
         _refuse(equation)
@@ -183,8 +185,6 @@ class _Writer:
             return [self.converted(_kind(equation.invars[0]), params["new_dtype"].kind, operands[0])]
         if name == "integer_pow":
             return [self.power(operands[0], params["y"], whole)]
-        if name == "named":
-            return [self.each(Op(f"{params['function']}({{}})", params["value"], own=True), whole, *operands)]
         if name == "clamp":
             low, x, high = operands
             return [self.each(_OPS["min"], whole, self.each(_OPS["max"], whole, x, low), high)]

@@ -47,6 +47,9 @@ def write_urdf(fitted: Identified, out: Path | str) -> list[str]:
             left += [f"the {what} of {joint.name}"] if float(system.values.get(f"{joint.name}.{what}", 0.0)) else []
         own = [(law.name, law.values()) for law in fitted.model.effects if law.joint == number]
         damping = form.viscous + sum(float(values["b"]) for name, values in own if name == "motor_back_emf")
+        if joint.name not in elements:  # one of the three of a planar joint
+            left.append(f"friction and limit of {joint.name}, which is no joint of its own")
+            continue
         _set(elements[joint.name], "dynamics", damping=damping, friction=form.coulomb)
         if limits := [float(values["limit"]) for name, values in own if name == "saturation"]:
             _set(elements[joint.name], "limit", effort=min(limits))
@@ -83,8 +86,7 @@ def _pseudo_inertia(mass, centre, inertia) -> Float[np.ndarray, "4 4"]:
 def _add(link: ET.Element, change: Float[np.ndarray, "4 4"]) -> bool:
     """Change the inertial of a link by a pseudo-inertia; False where no body has what is left of it."""
     inertial = link.find("inertial")
-    inertial = ET.SubElement(link, "inertial") if inertial is None else inertial
-    parts = {part.tag: part.attrib for part in inertial}
+    parts = {part.tag: part.attrib for part in (() if inertial is None else inertial)}
     numbers = lambda tag, key, default: np.array(str(parts.get(tag, {}).get(key, default)).split(), float)  # noqa: E731
     inertia = np.zeros((3, 3))
     for i, j in PAIRS:
@@ -95,6 +97,7 @@ def _add(link: ET.Element, change: Float[np.ndarray, "4 4"]) -> bool:
     mass = own[3, 3]
     if mass <= 0 or np.linalg.eigvalsh(own)[0] < -1e-9 * np.trace(own):
         return False
+    inertial = ET.SubElement(link, "inertial") if inertial is None else inertial
     centre = own[:3, 3] / mass
     second = own[:3, :3] - mass * np.outer(centre, centre)
     inertia = np.trace(second) * np.eye(3) - second

@@ -16,8 +16,8 @@ readers: dict[str, Any] = {
     ".hdf5": hdf5_file,
     **dict.fromkeys((".csv", ".parquet", ".mat", ".txt", ".tsv", ".lvm", *table_file.SHEETS), table_file),
 }
-"""Module by the end of the name; for another kind of file, add one.  `topics(path)` lists topics and their fields
-without reading the whole file, `read(path, fields)` gives the numbers at some paths of some topics.
+"""Module by the end of the name; for another kind of file, add one.  `topics(path)` lists topics and their fields,
+`read(path, fields)` gives the numbers at some paths of some topics.
 """
 _ELSEWHERE = {
     ".trace": "save the trace as *.trace.csv in CODESYS",

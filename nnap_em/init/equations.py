@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from ..data.dataset import DataError
 from ..data.noise import reading_noise, resolution
 from ..data.rig import toml_text
 from ..import_.files import reader
@@ -18,6 +19,8 @@ def draft_equations(path: Path) -> Draft:
     Raises DataError where the log cannot be read.
     """
     names = [Address(topic.name, field) for topic in reader(path).topics(path) for field in topic.fields]
+    if not names:
+        raise DataError(f"{path}: holds no column beside the time; give a log with inputs and readings")
     table = columns_table(path, {at.path: at for at in names})
     columns = {name: values for name, values in table.items() if name != "time"}
     inputs = {name for name, values in columns.items() if _input(name, values)}

@@ -12,6 +12,7 @@ from ..data.rig import Declaration, Declared, RigWarning, SystemSpec, every, kin
 from ..data.servo import TORQUE, Drive, read_drives, scaled
 from ..data.servo import named as drive_numbers
 from .mjcf import Part, read_file
+from .spec import uncommented
 
 OF_JOINT = ("armature", "stiffness")
 
@@ -54,7 +55,7 @@ def declare(root: Any) -> Declaration:
         kinds_of(drives),
         scales,
         file=file,
-        urdf=text if "<robot" in text else "",
+        urdf=text if "<robot" in uncommented(path) else "",
     )
 
 

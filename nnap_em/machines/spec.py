@@ -43,9 +43,11 @@ def opened(path: Path) -> Any:
 
     Raises MachineError at macros that are not expanded, and at what MuJoCo's parser refuses.
     """
-    parser, heard, text = mujoco(), [], _text(path)
-    if macro := re.search(r"<xacro:\w+|\$\{[^}\n]*\}|\$\(arg[^)\n]*\)", text):
-        line = text.count("\n", 0, macro.start()) + 1
+    parser, heard, text = mujoco(), [], uncommented(path)
+    unread = r"(?s)<(visual|collision|gazebo|ros2_control)\b.*?</\1>"  # of which no number is read
+    macros = re.sub(unread, lambda part: "\n" * part[0].count("\n"), text)
+    if macro := re.search(r"<xacro:\w+|\$\{[^}\n]*\}|\$\(arg[^)\n]*\)", macros):
+        line = macros.count("\n", 0, macro.start()) + 1
         hint = f"expand it first, with xacro {path.name} > expanded.urdf, and give that file"
         refuse(path, f"line {line}: {macro[0]}{'>' * (macro[0][0] == '<')} is xacro", hint)
     parser.set_mju_user_warning(heard.append)
@@ -68,7 +70,7 @@ def opened(path: Path) -> Any:
     return spec
 
 
-def _text(path: Path) -> str:
+def uncommented(path: Path) -> str:
     """The file without its comments; its tags are ASCII in every encoding."""
     try:
         text = path.read_bytes().decode("latin-1")

@@ -177,7 +177,8 @@ def _sections(document: dict[str, Any], design: Design) -> list[Section | None]:
     if friction:
         caption = "Standard deviation of the learned friction: now, expected, and after as much time of the old inputs."
         bands = [picture("found", "Friction bands", caption, bands_figure(friction, names))]
-    known = [[f"friction of joint {f['joint']} near rest", "", *_gain(f["near_rest"])] for f in friction]
+    slow = lambda f: f"below {number(f['near_rest_below'], 2)} {names.unit(names.rates[f['joint'] - 1])}"  # noqa: E731
+    known = [[f"friction of joint {f['joint']} near rest", slow(f), *_gain(f["near_rest"])] for f in friction]
     known += [[name, f"{number(p['value'])} {p['unit']}", *_gain(p)] for name, p in document["parameters"].items()]
     states = [f"{name} [{document['units'][name]}]" for name in document["starts"][0]]
     starts = [

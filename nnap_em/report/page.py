@@ -236,6 +236,7 @@ def _round(entry: _Entry) -> Section | None:
         best = sorted(entry.get(name) or [], key=lambda each: -(each.get("gain") or 0.0))[:8]
         tables.append(Table(["effect", measure], [[label(each), number(each["gain"])] for each in best]))
     untried = f"{entry['untried']} more candidates over their bar were not tried." if entry.get("untried") else ""
+    untried = untried or ("" if any(table.rows for table in tables) else "No candidate was scored.")
     return section(f"Over {number(entry['horizon_s'])} s: added {entry['accepted'] or 'nothing'}", untried, *tables)
 
 

@@ -3,11 +3,9 @@
 With options it is a function, `lambda bank: ParticleSmoother(CubatureSmoother(bank), num_particles=1000)`.
 """
 
-from .fit.branches import Branch, branches
 from .smoother.gaussian import CubatureSmoother, ExtendedKalmanSmoother
 from .smoother.mixture import MixtureSmoother
 from .smoother.particle import ParticleSmoother
 from .smoother.posterior import Posterior
 
-__all__ = ["Branch", "CubatureSmoother", "ExtendedKalmanSmoother", "MixtureSmoother", "ParticleSmoother"]
-__all__ += ["Posterior", "branches"]
+__all__ = ["CubatureSmoother", "ExtendedKalmanSmoother", "MixtureSmoother", "ParticleSmoother", "Posterior"]

@@ -8,7 +8,6 @@ import pytest
 
 from nnap_em.data.dataset import Dataset
 from nnap_em.em.loop import _replaced, e_step
-from nnap_em.fit.branches import BRANCH_DISTANCE, branches, modes
 from nnap_em.model.base import AbstractModel, prepare
 from nnap_em.numerics.gaussian import Gaussian
 from nnap_em.smoother.gaussian import CubatureSmoother
@@ -220,20 +219,6 @@ def test_the_likelier_of_both_paths_is_taken():
     np.testing.assert_array_equal(posterior.loglik[1:3], first.loglik[1:3])
 
 
-def test_two_sides_that_nothing_decides_are_both_reported():
-    """With the square alone, and a start between them, the grid has half of its mass on each side."""
-    model, data = _model(mean=0.0), _logs([1, -1], ROWS)
-    others = branches(model, data, CubatureSmoother(StartBank((1,), (0,))), key=KEY)
-    assert [other.sequence for other in others] == [0, 1]
-    for i, other in enumerate(others):
-        x, posterior, _ = _grid(model, jax.tree.map(lambda a, i=i: a[i], data))
-        right = posterior[-1] * (x > 0)
-        np.testing.assert_allclose(right.sum(), 0.5, atol=1e-6)
-        assert other.angle == 0 and other.rows[1] == ROWS - 1
-        np.testing.assert_allclose(other.weight, 0.5, atol=0.1)
-        np.testing.assert_allclose(np.abs(other.mean[-1, 0]), right @ x / right.sum(), atol=0.05)
-
-
 def test_what_is_narrow_keeps_the_numbers_of_the_first_smoother():
     """The angle is read from the first row on; two programs of the same numbers differ by rounding."""
     model, data = _model(), _logs([1, -1], 0)
@@ -244,11 +229,3 @@ def test_what_is_narrow_keeps_the_numbers_of_the_first_smoother():
         jax.tree.leaves(first._replace(width=None)), jax.tree.leaves(posterior._replace(width=None)), strict=True
     ):
         np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-14)
-
-
-def test_paths_that_differ_by_whole_turns_are_one_branch():
-    near, far = np.full((5, 1), 0.2), np.full((5, 1), 0.3 + BRANCH_DISTANCE)
-    paths = np.stack([near, near + 2 * np.pi, far, near + 0.5 * BRANCH_DISTANCE, far])
-    chosen, weight = modes(np.append(np.log([4.0, 3.0, 1.0, 2.0]), -np.inf), paths)
-    assert chosen.tolist() == [0, 2]
-    np.testing.assert_allclose(weight, [0.8, 0.2])

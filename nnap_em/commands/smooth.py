@@ -10,9 +10,7 @@ import argparse
 
 import numpy as np
 
-from ..data.logs import Logs, read_logs
-from ..fit.branches import Branch, branches
-from ..fit.identify import Identified
+from ..data.logs import read_logs
 from ..fit.predict import smooth
 from ..fit.store import load, model_file
 from ..numerics.digits import counted
@@ -28,14 +26,3 @@ def run(args: argparse.Namespace, log: Log) -> None:
     mean, std = np.asarray(state.mean), np.sqrt(np.diagonal(np.asarray(state.cov), axis1=-2, axis2=-1))
     write_states(args.out, logs, fitted.model.system.readable, mean, std)
     log(f"wrote {counted(len(logs.files), 'file')} to {args.out}")
-    for other in branches(fitted.model, logs.data, fitted.smoother.tolerant(), key=fitted.state.key):
-        log(_line(other, fitted, logs))
-
-
-def _line(other: Branch, fitted: Identified, logs: Logs) -> str:
-    """The place of another branch and its probability."""
-    first, last = other.rows
-    t, name = np.asarray(logs.data.t[other.sequence]), fitted.model.system.coordinates[other.angle]
-    ends = " to ".join(f"{other.mean[row, other.angle]:.2f}" for row in dict.fromkeys(other.rows))
-    span = f"from {t[first]:.2f} to {t[last]:.2f} s"
-    return f"{logs.files[other.sequence]}: with probability {other.weight:.2f} {name} is {ends} rad {span} instead"

@@ -65,8 +65,6 @@ class Identified(NamedTuple):
     """Smoother of the fit and of all that uses it: prediction, residuals and the search for missing effects."""
     discrepancy: float = 0.0
     """Size of the forces that no part of the model describes (`stated.widened`); 0 where likelihood is efficient."""
-    horizon_note: str | None = None
-    """Sentence on fits by likelihood and by errors over the horizon of use; of equations alone."""
     rise: float = 0.0
     """Rise of the log-likelihood at the end of EM (`loop.unsettled`) [nat a sequence]: more epochs would go on."""
     accuracy: tuple[tuple, ...] = ()
@@ -240,12 +238,12 @@ def _simulating(fitted: Identified, data: Dataset) -> Identified:
     fits = [simulated.fit(one, prior, data, scale=scale, begin=begin) for one in (declared, model)]
     best = max(fits, key=lambda of: simulated.log_posterior(of, scale, of.observed))
     kept = fitted_to_horizon(fitted._replace(state=fitted.state._replace(best=best.model)), data)
-    likely, last = (simulated.fit(one.model, _nothing(prior), data, scale=scale, begin=begin) for one in (fitted, kept))
-    costs = [simulated.cost(of.error, scale, of.observed) for of in (likely, last)]
+    both = [simulated.fit(one.model, _nothing(prior), data, scale=scale, begin=begin) for one in (fitted, kept)]
+    costs = [simulated.cost(of.error, scale, of.observed) for of in both]
     if costs[0] < costs[1]:
         own = simulated.simulated(model, prior, data, begin)
         kept = fitted._replace(state=fitted.state._replace(hessian=jnp.asarray(simulated.precision(own))))
-    return kept._replace(horizon_note=_horizon_note(kept, likely, last))
+    return kept
 
 
 def _nothing(prior: ParameterPrior) -> ParameterPrior:
@@ -265,18 +263,6 @@ def fitted_to_horizon(fitted: Identified, data: Dataset) -> Identified:
     hessian = jnp.asarray(simulated.precision(best))
     state = fitted.state._replace(best=best.model, model=best.model, proposal=best.model, hessian=hessian)
     return fitted._replace(state=state, accuracy=simulating(fitted.rig, best.model, best.error, data))
-
-
-def _horizon_note(fitted: Identified, likely: simulated.Simulated, best: simulated.Simulated) -> str:
-    """Errors of both fits over the horizon of use, and what it means where they disagree."""
-    first, second = (np.sqrt(np.nanmean(of.error**2, axis=(0, 1, 2))) for of in (likely, best))
-    unit = fitted.model.system.unit
-    each = zip(fitted.rig.measured, first, second, strict=True)
-    parts = [f"{name}: {a:.3g} and {b:.3g} {unit(name)}".rstrip() for name, a, b in each]
-    text = "errors of free simulations of the fit by likelihood and of the one to such errors: "
-    worse = 1.2  # error of the likelier fit over that of the fit to such errors from which on they differ
-    odd = " They differ: something is missing in the equations." if np.any(first > worse * second) else ""
-    return f"{text}{', '.join(parts)}.{odd}"
 
 
 def phi_samples(fitted: Identified, count: int, *, key: PRNGKeyArray) -> Float[Array, "sample phi"]:

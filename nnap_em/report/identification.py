@@ -28,7 +28,7 @@ from .fit_plots import error_figure, friction_figure, term_figure
 from .html import Picture, picture, write_report
 from .page import page
 from .tables import visited_nodes, write_friction
-from .wording import reached, sentence
+from .wording import reached
 
 
 @stage("report")
@@ -82,7 +82,6 @@ def write_identification(
         "noise": noise(fitted),
         "parameters": parameters(fitted),
         "stopped": _stopped_early(fitted),
-        "horizon_note": fitted.horizon_note,
         "friction_law": laws,
         "unknown": terms,
         "log_likelihood": fitted.state.loglik.tolist(),
@@ -112,8 +111,7 @@ def _verdict(
     text = f"Fitted {estimated} to {used}{f'; {early}' if early else rested}."
     first, after = [fitted.misfit.text] * bool(fitted.misfit.text), [f"{'; '.join(causes)}."] * bool(causes)
     first, last = (first, []) if fitted.misfit.useless else ([], first)
-    notes = [sentence(fitted.horizon_note)] * bool(fitted.horizon_note)
-    return " ".join([*first, *after, text, *last, *notes, *(one.sentence for one in far)])
+    return " ".join([*first, *after, text, *last, *(one.sentence for one in far)])
 
 
 def _stopped_early(fitted: Identified) -> str:
@@ -132,8 +130,6 @@ def _log_summary(document: dict[str, Any], log: Log) -> None:
         log(law["text"])
     if document["stopped"]:
         log(document["stopped"])
-    if document["horizon_note"]:
-        log(document["horizon_note"])
     if document["left_out"]:
         log(f"diverged, and left out of the last epoch: {listed(document['left_out'])}")
     error = document["error"] or {"fit": {}}

@@ -16,17 +16,17 @@ SHARE_LEFT = 1e-6
 """Share of a parameter's own column that must be left when those of the others are taken out of it."""
 _MOMENTS = ("delay", "limit")
 """Numbers of a servo that the slopes of its torque do not know."""
+_POWERS = 4
+"""Powers of a rate that stand for a learned friction."""
 
 
 class Identifiability(NamedTuple):
     """Uncertain parameters that keep, alone or along a combination, what was declared."""
 
-    never: tuple[str, ...]
+    never: tuple[str, ...] = ()
     """Numbers that no motion depends on."""
-    together: tuple[tuple[str, ...], ...]
-    """Groups of which motions depend on fewer combinations than members."""
-    rubbed: tuple[str, ...] = ()
-    """Numbers of servos that the learned friction of their joint can take the place of."""
+    together: tuple[tuple[str, ...], ...] = ()
+    """Groups of which motions depend on fewer combinations than members; learned friction may be one of them."""
 
 
 def identifiability(rig: Rig, system: AbstractSystem, servos: tuple[Servo, ...] = ()) -> Identifiability:
@@ -34,29 +34,23 @@ def identifiability(rig: Rig, system: AbstractSystem, servos: tuple[Servo, ...] 
 
     [Gautier & Khalil 1990, IEEE Trans. Robotics and Automation 6(3): base parameters]  By the null space of its
     derivatives at random states, each in declared standard deviations.  With servos, whose torque is no column, it is
-    M(q) a + c(q, v) - tau(u, q, v), at the accelerations that the servos give, and without what a learned friction of
-    the joints holds.  Delays and limits are left out: only single moments depend on them.
+    M(q) a + c(q, v) - tau(u, q, v), at the accelerations that the servos give, beside a learned friction of the joints.
+    Delays and limits are left out: only single moments depend on them.
     """
     names = [name for name, declared in rig.parameters.items() if declared.std > 0]
     names = [name for name in names if name in rig.bodies or name.rpartition(".")[2] not in _MOMENTS]
     if not names:
-        return Identifiability((), ())
+        return Identifiability()
     columns, friction = _columns(system, servos, names)
     columns = columns * np.asarray([rig.parameters[name].std for name in names])[None, :]
     size = np.linalg.norm(columns, axis=0)
-    rubbed: list[int] = []
+    felt = size > SHARE_LEFT * size.max()
+    labels = [name for name, one in zip(names, felt, strict=True) if one]
+    columns = columns[:, felt] / size[felt]
     if servos and rig.friction:
-        columns = columns - friction @ np.linalg.lstsq(friction, columns, rcond=None)[0]
-        rubbed = [
-            i for i, left in enumerate(np.linalg.norm(columns, axis=0)) if left <= SHARE_LEFT * size[i] and size[i] > 0
-        ]
-        size = np.where(np.isin(np.arange(len(names)), rubbed), 0.0, size)
-    gone = [i for i in range(len(names)) if size[i] <= SHARE_LEFT * size.max(initial=0.0)]
-    never = [i for i in gone if i not in rubbed]
-    left = [i for i in range(len(names)) if i not in gone]
-    if not left:
-        return Identifiability(tuple(names[i] for i in never), (), tuple(names[i] for i in rubbed))
-    _, values, rows = np.linalg.svd(columns[:, left] / size[left], full_matrices=True)
+        labels += [f"the learned friction of joint {1 + i // _POWERS}" for i in range(friction.shape[1])]
+        columns = np.concatenate([columns, friction / np.linalg.norm(friction, axis=0)], axis=1)
+    _, values, rows = np.linalg.svd(columns, full_matrices=True)
     rank = int(np.sum(values > SHARE_LEFT * values.max(initial=1e-300)))
     shared = np.abs(rows[rank:].T @ rows[rank:])
     groups: list[set[int]] = []
@@ -66,8 +60,8 @@ def identifiability(rig: Rig, system: AbstractSystem, servos: tuple[Servo, ...] 
             groups.remove(other)
             group |= other
         groups.append(group)
-    together = tuple(tuple(names[left[i]] for i in sorted(group)) for group in groups)
-    return Identifiability(tuple(names[i] for i in never), together, tuple(names[i] for i in rubbed))
+    together = tuple(tuple(dict.fromkeys(labels[i] for i in sorted(group))) for group in groups)
+    return Identifiability(tuple(name for name, one in zip(names, felt, strict=True) if not one), together)
 
 
 def _columns(
@@ -99,20 +93,13 @@ def _columns(
         accelerations = lambda q, v, u: jnp.stack(system.acceleration(q, v, driven(system, servos, q, v, u)))  # noqa: E731
         a = jax.jit(jax.vmap(accelerations))(q, v, u)
     slopes = jax.jit(jax.jacfwd(force))(values, a)
-    powers = np.asarray(v)[:, :, None] ** np.arange(4)
+    powers = np.asarray(v)[:, :, None] ** np.arange(_POWERS)
     curves = np.einsum("rjp,ij->rijp", powers, np.eye(dof)).reshape(q.size, -1)
     return np.stack([np.asarray(slope, np.float64) for slope in slopes], axis=1), curves
 
 
 def sentences(result: Identifiability) -> list[str]:
     """Sentences of a report on parameters that are not identifiable."""
-    out = []
-    if result.never:
-        out.append(f"no motion depends on {', '.join(result.never)}: kept as declared; declare them as numbers")
-    if result.rubbed:
-        text = f"motions do not separate {', '.join(result.rubbed)} from the learned friction of the joint"
-        out.append(f"{text}: kept as declared, and friction is what is left; write a number where you know one")
-    for group in result.together:
-        text = f"motions determine {', '.join(group)} only in combination"
-        out.append(f"{text}: along the rest they keep what is declared, and their std says so")
-    return out
+    never = f"no motion depends on {', '.join(result.never)}: kept as declared; declare them as numbers"
+    kept = "only in combination: along the rest they keep what is declared, and their std says so"
+    return [never] * bool(result.never) + [f"motions determine {', '.join(g)} {kept}" for g in result.together]

@@ -61,7 +61,7 @@ def test_rigs_that_differ_are_named_key_by_key():
     rig = slide_rig()
     assert differences(rig, dataclasses.replace(rig, name="another")) == []
     heavier = dataclasses.replace(rig, parameters={"m": Declared(1.3, 0.1)})
-    assert differences(rig, heavier) == ["m of parameters is 1.1 ± 0.1 in the fit and 1.3 ± 0.1 here"]
+    assert differences(rig, heavier) == ["m of parameters is 1.1 +- 0.1 in the fit and 1.3 +- 0.1 here"]
     with pytest.raises(DataError, match=r"is not that of the fit: dt is 0.01 in the fit and 0.02 here"):
         differences(rig, dataclasses.replace(rig, dt=0.02))
     with pytest.raises(DataError, match="written as equations"):

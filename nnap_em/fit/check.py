@@ -12,7 +12,7 @@ from jaxtyping import Float, PRNGKeyArray
 from ..data.dataset import Array, Dataset
 from ..data.logs import REPEAT, Logs, logs_of_arrays
 from ..data.machine import unpacked
-from ..data.noise import reading_noise, resolution
+from ..data.noise import reading_noise
 from ..data.rig import HOLD, SMOOTH, Rig, RigError
 from ..data.servo import TORQUE
 from ..em.build import LAG, NO_MACHINE, Scales, build_system, measure_scales
@@ -31,7 +31,7 @@ from ..systems import AbstractSystem
 from .identifiability import identifiability, sentences
 from .identify import Identified, begin
 from .inverse_dynamics import UNEXPLAINED, Lag, explanations, gains, lag, mistakes, regression
-from .rates import bridged, timings
+from .rates import bridged, timing
 
 OK, WARNING, ERROR = "ok", "warning", "error"
 SEQUENCES, SECONDS, FEWEST_SAMPLES = 6, 1.0, 10
@@ -64,7 +64,7 @@ class Along(NamedTuple):
     reading: Float[np.ndarray, "seq time obs state"]
     """Jacobian of the reading."""
     rate: Float[np.ndarray, "seq time state state"] | None = None
-    """Jacobian of the time derivative of the state [1/s]."""
+    """Jacobian of the time derivative of the state [1/s]; not of equations."""
 
 
 def check(
@@ -91,7 +91,7 @@ def check(
     """
     train, test = logs_of_arrays(train, rig), None if test is None else logs_of_arrays(test, rig)
     data = Dataset(*(np.asarray(part) for part in train.data))
-    amount = [*_amount(rig, data, test), *_missing(train, rig), *_rough(train), *rates(rig, data)]
+    amount = [*_amount(rig, data, test), *_readings(train, rig), *rates(rig, data)]
     if amount[0].mark == ERROR:
         return amount
     try:
@@ -124,9 +124,9 @@ def check(
     ]
 
 
-def _window(dt: float, seconds: float = SECONDS) -> int:
+def _window(dt: float) -> int:
     """Rows that are smoothed with the first model."""
-    return max(round(seconds / dt), FEWEST_SAMPLES)
+    return max(round(SECONDS / dt), FEWEST_SAMPLES)
 
 
 def _equations(rig: Rig, problem: Identified, data: Dataset) -> Iterator[CheckResult]:
@@ -134,23 +134,19 @@ def _equations(rig: Rig, problem: Identified, data: Dataset) -> Iterator[CheckRe
     model, longest = problem.model, float(data.valid.sum(axis=1).max()) * rig.dt
     seen = motion(model, data)
     fastest, growing = 1 / max(seen.fastest, 1e-12), 1 / seen.growth if seen.growth else np.inf
-    constants = f"time constants of the declared equations are {fastest:.3g} to {seen.slowest:.3g} s, "
-    modes = [f"{constants if np.isfinite(seen.slowest) else ''}rows {rig.dt:g} s apart"]
-    modes += [f"integrators: {', '.join(seen.kept)}"] if seen.kept else []
-    grown = f"deviations of {', '.join(seen.unstable)} grow at {seen.growth:.3g} 1/s, e-fold in {growing:.3g} s"
-    modes += [f"unstable: {grown}"] if seen.growth else []
-    quick = "the fastest is over between two rows: sample faster, or look at the units of parameters"
+    text = f"rows {rig.dt:g} s apart, time constants of the declared equations {fastest:.3g} to {seen.slowest:.3g} s"
+    text += f"; integrators: {', '.join(seen.kept)}" if seen.kept else ""
+    grown = f"; unstable: deviations of {', '.join(seen.unstable)} grow at {seen.growth:.3g} 1/s"
+    text += f"{grown if seen.growth else ''}; predictions are judged up to {model.pace:g} s ahead"
     errors = {
         "no states follow the readings: look at signs, units and parameters": not len(seen.rate),
         "errors grow too fast between two rows: sample faster, or look at units and signs": growing < 2 * rig.dt,
     }
+    brief = longest < RECORDED * seen.slowest < np.inf
     warnings = {
-        quick: fastest < rig.dt,
-        f"record {RECORDED:g} of the slowest at least, here {longest:.3g} s": longest
-        < RECORDED * seen.slowest
-        < np.inf,
+        "the fastest is over between two rows: sample faster, or look at the units of parameters": fastest < rig.dt,
+        f"record {RECORDED:g} of the slowest at least, here {longest:.3g} s": brief,
     }
-    text = f"{'; '.join(modes)}; predictions are judged up to {model.pace:g} s ahead"
     yield _result("sampling", text, errors, warnings)
     yield from _noise(rig, model, data)
     at = windows(model, data)  # a start that nothing shows, as at rest, is one of many
@@ -187,17 +183,16 @@ def _result(subject: str, text: str, errors: Mapping[str, object], warnings: Map
     """A result with the hints of those errors and warnings that hold."""
     mark = ERROR if any(errors.values()) else WARNING if any(warnings.values()) else OK
     hints = dict.fromkeys(hint for hint, holds in (*errors.items(), *warnings.items()) if holds)
-    return CheckResult(mark, subject, "; ".join([text, *filter(None, hints)]))
+    return CheckResult(mark, subject, "; ".join(filter(None, [text, *hints])))
 
 
 def _amount(rig: Rig, data: Dataset, test: Logs | None) -> Iterator[CheckResult]:
     rows = data.valid.sum(axis=1)
-    few, what = rows.sum() < 100 or rows.max() < 20, "numbers" if rig.equations else "curve"
-    too_long = rows.max() * rig.dt > _LONG[0] and rows.max() > _LONG[1] and not rig.equations
+    few = rows.sum() < 100 or rows.max() < 20
     warnings = {
-        f"more would make the {what} surer": rows.sum() < 1000 and not few,
+        "more would make the result surer": rows.sum() < 1000 and not few,
         f"the shortest is {rows.min() * rig.dt:.2g} s: leave out what is under 60 rows": rows.min() < 60,
-        "cut them into sequences of some seconds": too_long,
+        "cut them into sequences of some seconds": rows.max() > max(_LONG[0] / rig.dt, _LONG[1]) and not rig.equations,
     }
     text = f"{counted(len(rows), 'training sequence')}, {rows.sum() * rig.dt:.3g} s, {rows.sum()} rows"
     yield _result("length", text, {"too few; record some minutes": few}, warnings)
@@ -207,15 +202,16 @@ def _amount(rig: Rig, data: Dataset, test: Logs | None) -> Iterator[CheckResult]
         yield CheckResult(OK, "test", f"{counted(len(test.files), 'test sequence')}, none of them in train")
 
 
-def _missing(train: Logs, rig: Rig) -> Iterator[CheckResult]:
-    """Missing samples of each column, and the rows in which each reading stands, where it is more than one."""
-    rows, repeated = np.asarray(train.data.valid).sum(axis=1), {}
+def _readings(train: Logs, rig: Rig) -> Iterator[CheckResult]:
+    """Missing samples of each column, the rows in which each reading stands, and what was masked on reading."""
+    rows, repeated, rough = np.asarray(train.data.valid).sum(axis=1), {}, {}
     for entry in train.masked:
         if entry.kind == REPEAT:
             repeated[entry.column, entry.file] = entry.amount
+        else:
+            rough.setdefault((entry.kind, entry.column), []).append(entry)
     for name, y in zip(rig.measured, np.moveaxis(np.asarray(train.data.y), -1, 0), strict=True):
-        read = np.isfinite(y).sum(axis=1)
-        again = np.array([repeated.get((name, file), 0) for file in train.files])
+        read, again = np.isfinite(y).sum(axis=1), np.array([repeated.get((name, file), 0) for file in train.files])
         gone = rows - read - again
         share = gone.sum() / rows.sum()
         text = f"{name}: {100 * share:.0f} % of the samples are missing"
@@ -226,18 +222,12 @@ def _missing(train: Logs, rig: Rig) -> Iterator[CheckResult]:
             text = f"{name}: each reading stands in {stands:.3g} rows, in {files} of {counted(len(again), 'file')}; "
             text += f"all but the first are missing samples: {stands * rig.dt:.3g} s lie between two readings"
             yield CheckResult(WARNING, "held", text)
-
-
-def _rough(train: Logs) -> Iterator[CheckResult]:
-    """Readings masked on reading, and their share of each column."""
-    masked = [entry for entry in train.masked if entry.kind != REPEAT]
-    for kind, column in dict.fromkeys((entry.kind, entry.column) for entry in masked):
-        entries = [entry for entry in masked if (entry.kind, entry.column) == (kind, column)]
-        count, where = sum(entry.amount for entry in entries), f"{column}: " if column else ""
-        files = f"{len({entry.file for entry in entries})} of {counted(len(train.files), 'file')}"
-        text = f"{where}{kind}: {counted(count, 'reading' if column else 'row')} in {files}, most in "
-        text += max(entries, key=lambda entry: entry.amount).file
-        yield CheckResult(ERROR if count > 0.3 * np.sum(train.data.valid) else WARNING, "rough", text)
+    for (kind, column), entries in rough.items():
+        count = sum(entry.amount for entry in entries)
+        text = f"{column}: {kind}: " if column else f"{kind}: "
+        text += f"{counted(count, 'reading' if column else 'row')} in {len({entry.file for entry in entries})} of "
+        text += f"{counted(len(train.files), 'file')}, most in {max(entries, key=lambda entry: entry.amount).file}"
+        yield CheckResult(ERROR if count > 0.3 * rows.sum() else WARNING, "rough", text)
 
 
 def _sampling(rig: Rig, along: Along, scales: Scales) -> Iterator[CheckResult]:
@@ -256,27 +246,35 @@ def _sampling(rig: Rig, along: Along, scales: Scales) -> Iterator[CheckResult]:
 def _noise(rig: Rig, model: StateSpaceModel, data: Dataset) -> Iterator[CheckResult]:
     """Noise of the readings beside that which is declared, and beside their motion."""
     for i, name in enumerate(rig.measured):
-        unit, signal = model.system.unit(name), np.asarray(data.y)[..., i]
-        seen, codes, declared = reading_noise(signal), resolution(signal), rig.noise_std.get(name)
+        unit, signal, declared = model.system.unit(name), np.asarray(data.y)[..., i], rig.noise_std.get(name)
+        seen = reading_noise(signal)
         noisy = max(seen, declared or 0.0) > 0.3 * _std(signal)
         alone = name not in model.system.sensors  # of three axes one may sense nothing
         ratio, text = 1.0, f"about {seen:.2g} {unit}, not declared, so it is estimated"
         if declared:
             ratio = seen / declared
             text = f"declared {declared:.2g} {unit}, the log's high frequencies show {seen:.2g} {unit}"
-        steps = f"it reads codes {codes:.2g} {unit} apart and repeats them, which is noise of {codes / 12**0.5:.2g}"
-        text = f"{name}: {text}; {steps}" if codes else f"{name}: {text}"
         more = "declare more, or leave it out to have it estimated"
         drowned = "the motion hardly rises above it: move or excite more, or look at the units"
         tame = "the log was filtered, or less is true"
         errors = {more: ratio > 30, drowned: noisy and alone}
-        yield _result("noise", text, errors, {tame: ratio < 0.1, more: ratio > 3, drowned: noisy})
+        yield _result("noise", f"{name}: {text}", errors, {tame: ratio < 0.1, more: ratio > 3, drowned: noisy})
 
 
 def rates(rig: Rig, data: Dataset) -> Iterator[CheckResult]:
     """Each rate against the derivative of its coordinate, where both are read."""
-    for wrong, text in timings(rig, data):
-        yield CheckResult(WARNING if wrong else OK, "rate", text)
+    for name, rate in rig.pairs():
+        y, w = (np.asarray(data.y)[..., rig.measured.index(column)] for column in (name, rate))
+        found = timing(y, w, rig.dt)
+        if found is None:
+            continue
+        lag = f"{abs(found.late):.3g} s ({abs(found.late) / rig.dt:.3g} rows)"
+        late, first = (rate, f"the derivative of {name}") if found.late > 0 else (name, rate)
+        text = f"{rate} is the derivative of {name}, {lag} {'late' if found.late > 0 else 'early'}"
+        scaled = f"{rate} is {found.scale:.4g} times the derivative of {name}: correct the unit or gear of one"
+        shifted = f"{late} is {lag} later than {first}; take {late} out of [measurement] columns, or filter neither"
+        warnings = dict(zip((scaled, shifted), found.wrong, strict=True))
+        yield _result("rate", "" if any(found.wrong) else text, {}, warnings)
 
 
 def torques(rig: Rig, system: AbstractSystem, data: Dataset, scales: Scales) -> Iterator[CheckResult]:
@@ -337,27 +335,25 @@ def dynamics(rig: Rig, system: AbstractSystem, data: Dataset) -> Iterator[CheckR
         yield CheckResult(mark, "dynamics", f"{text}as it is {explained(plain)}")
     elif np.all(plain < UNEXPLAINED):
         text = f"declared bodies and a static friction explain {explained(plain)} of the torque, by joint"
+        for name, slope in zip(rig.input_columns, gains(problem), strict=True):
+            text += f"; {name}: slope {slope:.3g}"
         lags = {name: lag(problem, i) for i, (name, kind) in enumerate(rig.kinds.items()) if kind == TORQUE}
-        late_by = {name: f", {when} rows late" for name, when in lags.items() if np.isfinite(when.std)}
-        slopes = zip(rig.input_columns, gains(problem), strict=True)
-        text += "".join(f"; {name}: slope {slope:.3g}{late_by.get(name, '')}" for name, slope in slopes)
-        yield CheckResult(OK, "dynamics", text)
         for name, when in lags.items():
-            if when.counts:
-                yield CheckResult(WARNING, "hold", f"{name}: {late(rig, when)}")
+            text += f"; {name}: {when.rows:.2f} +- {when.std:.1g} rows late" if np.isfinite(when.std) else ""
+        yield CheckResult(OK, "dynamics", text)
+        yield from (CheckResult(WARNING, "hold", f"{n}: {late(rig, when)}") for n, when in lags.items() if when.counts)
 
 
 def late(rig: Rig, when: Lag) -> str:
     """An input that acts at another time than its hold has it, and the line to write."""
     other, between = (SMOOTH, -0.5) if rig.input_hold == HOLD else (HOLD, 0.5)
-    kind = "a measured signal, which is not held" if other == SMOOTH else "a command that is held"
     side = f"{abs(when.rows):.2g} +- {when.std:.1g} rows {'later' if when.rows > 0 else 'earlier'}"
     text = f"torque and motion agree best if it acts {side} than `input_hold` has it ({when.rows * rig.dt:.2g} s)"
     if abs(when.rows - between) < SAME_HOLD:
+        kind = "a measured signal, which is not held" if other == SMOOTH else "a command that is held"
         return f'{text}: it is {kind}; write [sampling] input_hold = "{other}"'
-    cause = (
-        "a drive or a bus that is late (`diagnose` finds input_delay)" if when.rows > 0 else "readings that are late"
-    )
+    drive = "a drive or a bus that is late (`diagnose` finds input_delay)"
+    cause = drive if when.rows > 0 else "readings that are late"
     return f"{text}: {cause}, or two clocks (`nnap-em import --shift TOPIC=SECONDS`)"
 
 
@@ -369,16 +365,15 @@ def drives(
     gravity: Float[np.ndarray, " dof"],
 ) -> Iterator[CheckResult]:
     """Limits and delays of the declared servos against the logs."""
-    servos, length = build_servos(rig), float(data.valid.sum(axis=1).min()) * rig.dt
-    for i, (servo, joint) in enumerate(zip(servos, rig.input_joints, strict=False)):
-        name, unit = servo.column, system.force_unit(joint)
+    length = float(data.valid.sum(axis=1).min()) * rig.dt
+    for i, (servo, joint, gear) in enumerate(zip(build_servos(rig), rig.input_joints, system.gears, strict=False)):
         if not servo.feeds_back:
             continue
-        limit, gear = float(servo.values.get("limit", np.inf)), abs(system.gears[i])
-        weight, whole = gravity[joint - 1] / gear, needed[joint - 1] / gear
-        delay, limited = float(servo.values.get("delay", 0.0)), f", limited to {limit:.3g} {unit}"
-        text = f"{name}: a {servo.kind} servo{limited if np.isfinite(limit) else ''}; gravity and inertia of joint "
-        text += f"{joint} need {whole:.3g}, gravity alone for {weight:.3g} {unit}"
+        name, unit = servo.column, system.force_unit(joint)
+        limit, delay = (float(servo.values.get(key, none)) for key, none in (("limit", np.inf), ("delay", 0.0)))
+        weight, whole = gravity[joint - 1] / abs(gear), needed[joint - 1] / abs(gear)
+        text = f"{name}: a {servo.kind} servo{f', limited to {limit:.3g} {unit}' if np.isfinite(limit) else ''}; "
+        text += f"gravity and inertia of joint {joint} need {whole:.3g}, gravity alone for {weight:.3g} {unit}"
         low = f"the limit is too low; write a higher one, or look at its unit ({unit}) and at masses (kg)"
         long = f"a delay of {delay:.3g} s is much of a sequence of {length:.3g} s: write it in seconds"
         warnings = {low: limit < 0.9 * weight, long: delay > 0.2 * length, "": limit < whole}
@@ -403,13 +398,11 @@ def _loads_along(
 
     A joint that bears nothing at zero may bear much elsewhere.  Joints that nobody reads are anywhere in a turn.
     """
-    y, valid = np.asarray(data.y), np.asarray(data.valid)
     read = [(i, rig.measured.index(name)) for i, name in enumerate(system.coordinates) if name in rig.measured]
-    seen = y[..., [column for _, column in read]][valid]
+    seen = np.asarray(data.y)[..., [column for _, column in read]][np.asarray(data.valid)]
     seen = seen[np.isfinite(seen).all(axis=1)]
     seen = seen[np.linspace(0, len(seen) - 1, POSES).astype(int)] if len(seen) else np.zeros((POSES, len(read)))
-    turn = np.random.default_rng(0).uniform(-np.pi, np.pi, (POSES, len(system.coordinates)))
-    q = np.where(system.angles, turn, 0.0)
+    q = np.where(system.angles, np.random.default_rng(0).uniform(-np.pi, np.pi, (POSES, len(system.angles))), 0.0)
     q[:, [joint for joint, _ in read]] = seen
     mass, gravity = map(np.asarray, _loads(system, jnp.asarray(q)))
     return np.mean(mass, axis=0), np.percentile(np.abs(gravity), 99, axis=0)
@@ -417,9 +410,7 @@ def _loads_along(
 
 @eqx.filter_jit
 def _loads(system: AbstractSystem, q: Float[Array, "pose dof"]) -> tuple[Array, Array]:
-    """Inertia and gravity of every joint in some poses."""
-    still = jnp.zeros(q.shape[1])
-    return jax.vmap(lambda q: (jnp.diag(system.mass(q)), system.bias(q, still)))(q)
+    return jax.vmap(lambda q: (jnp.diag(system.mass(q)), system.bias(q, 0 * q)))(q)
 
 
 def _motion(rig: Rig, model: StateSpaceModel, data: Dataset, along: Along) -> Iterator[CheckResult]:
@@ -465,8 +456,7 @@ def _velocity(
         v = (y[:, LAG:] - y[:, :-LAG]) / (LAG * rig.dt)
         if np.isfinite(v).any():
             return v, ""
-    x = along.x[..., len(model.system.coordinates) + joint]
-    return np.where(np.isfinite(x), x, np.nan), " (never seen, by the declared model)"
+    return along.x[..., len(model.system.coordinates) + joint], " (never seen, by the declared model)"
 
 
 def _observability(
@@ -478,31 +468,27 @@ def _observability(
     """
     names, dof = model.system.states, len(model.system.coordinates)
     rows = rows or _window(model.dt)
-    x = along.x.reshape(-1, len(names))
-    scale = np.maximum([_std(one) for one in x.T], 1e-12)
-    noise = np.exp(0.5 * np.asarray(model.log_r))
-    grams = []
-    for i in range(len(along.x)):
-        last = min(rows, int(valid[i].sum()))
-        if last >= 2 and np.isfinite(along.transition[i, :last]).all():
-            gram = gramian(along.transition[i, :last], along.reading[i, :last] / noise[:, None], scale)
+    scale = np.maximum([_std(one) for one in along.x.reshape(-1, len(names)).T], 1e-12)
+    noise, grams = np.exp(0.5 * np.asarray(model.log_r))[:, None], []
+    for transition, reading, ok in zip(along.transition, along.reading, valid, strict=True):
+        last = min(rows, int(ok.sum()))
+        if last >= 2 and np.isfinite(transition[:last]).all():
+            gram = gramian(transition[:last], reading[:last] / noise, scale)
             grams += [gram] if np.isfinite(gram).all() else []
     if not grams:
         text = "the declared model cannot follow the logs; look at units, signs and parameters"
         yield CheckResult(ERROR, "states", text)
         return
     values = np.median([np.linalg.eigvalsh(gram) for gram in grams], axis=0)
-    known = np.median([undetermined(gram) for gram in grams], axis=0)
-    condition = np.log10(values[-1] / max(values[0], 1e-300 * values[-1]))
-    dark = [name for name, share in zip(names, known, strict=True) if share > 0.5]
-    weak = [name for name, share in zip(names, known, strict=True) if 0.2 < share <= 0.5]
+    known = dict(zip(names, np.median([undetermined(gram) for gram in grams], axis=0), strict=True))
+    dark = [name for name in names if known[name] > 0.5]
+    weak = [name for name in names if 0.2 < known[name] <= 0.5]
     shown = "move so that the hidden joint shakes the rest" if dof else "change the inputs so that it shows"
     spoilt = any(name in names[dof:] for name in dark)
     text = f"{rows * model.dt:.3g} s of readings determine {np.sum(values > 1)} of {len(names)} directions of the state"
     hidden = f"not determined: {', '.join(dark)}"
     warnings = {hidden: dark and not spoilt, f"hardly determined: {', '.join(weak)}": weak}
-    errors = {f"{hidden}: measure more of the state, or {shown}": spoilt}
-    yield _result("states", f"{text} (condition 1e{condition:.0f})", errors, warnings)
+    yield _result("states", text, {f"{hidden}: measure more of the state, or {shown}": spoilt}, warnings)
 
 
 def undetermined(gram: Float[np.ndarray, "state state"]) -> Float[np.ndarray, " state"]:

@@ -10,7 +10,7 @@ model"].
 
 import itertools
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
 import equinox as eqx
@@ -48,9 +48,7 @@ LARGEST_REMAINDER = 0.25
 """Largest ratio of the unexplained with a named mistake corrected to that without.
 
 On logs of seven double pendulums and a servo as recorded no correction leaves less than 0.6; where the mistake was made
-on purpose the right one leaves 0.3 at most at its joint, but for zeros off by 2 degrees and some by 10.  A six-axis arm
-leaves 0.07 without the gravity of the joint whose counterbalance is not declared, and is silent only because a unit
-ranks before that and explains too little.
+on purpose the right one leaves 0.3 at most at its joint, but for zeros off by 2 degrees and some by 10.
 """
 UNEXPLAINED = 0.2
 """Largest share of the squared torque that a named mistake leaves unexplained."""
@@ -64,11 +62,8 @@ with a triangle as its weight: of inputs that are held, and of smooth ones [Nume
 ERROR_BLOCKS = 20
 """Blocks of rows whose errors are taken as independent."""
 LATE, SURE_LAG, WITHOUT_LAG = 0.25, 5.0, 0.75
-"""Lag that counts [rows, and its standard deviations], and share of the unexplained squared torque that it leaves.
-
-On six double pendulums torques act 0.3 to 0.45 rows before their hold, which leaves 0.85 to 0.99; a servo's 4.9 rows
-late leave 0.95 where friction is what is missing; a load cell at 25 Hz, held, leaves 0.03.
-"""
+"""Lag that counts [rows, and its standard deviations], and share of the unexplained squared torque that it leaves: 0.85
+and more on double pendulums and a servo as recorded, 0.03 of a load cell at 25 Hz that was declared as held."""
 REACH = 6
 """Largest lag of a torque that is looked for [rows]."""
 
@@ -82,9 +77,6 @@ class Lag(NamedTuple):
     """Standard deviation of it, by blocks of rows."""
     remains: float
     """Squared torque that stays unexplained with it, over that without it."""
-
-    def __str__(self) -> str:
-        return f"{self.rows:.2f} +- {self.std:.1g}"
 
     @property
     def counts(self) -> bool:
@@ -153,15 +145,14 @@ class Regression(NamedTuple):
 
     def remains(
         self,
+        inputs: Float[np.ndarray, "row input"] | None = None,
         sign: np.ndarray | float = 1.0,
         shift: np.ndarray | float = 0.0,
         gravity: np.ndarray | float = 1.0,
-        gains: np.ndarray | float = 1.0,
-        order: Sequence[int] | slice = slice(None),
     ) -> Float[np.ndarray, " dof"]:
         """Share of the squared torque that stays unexplained, by joint, with these changes of the log."""
         share = np.stack([np.ones_like(self.size), np.ones_like(self.size), gravity * np.ones_like(self.size)])
-        applied = self.applied(gains * self.inputs[:, order])
+        applied = self.applied(self.inputs if inputs is None else inputs)
 
         def at(moved: np.ndarray) -> "Regression":
             values = zip(self.mean.items(), moved * self.std, strict=True)
@@ -230,8 +221,7 @@ def motion_along(rig: Rig, system: AbstractSystem, data: Dataset) -> Motion | No
     low = None
     # Rows of the low-pass: the first that leaves accelerations a noise below `ACCEL_NOISE`, else the last that fits
     for length in (length for length in (9, 15, 25, 41, 61) if 2 * length < a.shape[1]):
-        window = np.hanning(length + 2)[1:-1]
-        bell = window / window.sum()
+        bell = np.hanning(length + 2)[1:-1] / np.hanning(length + 2).sum()
         passed = filtered(a, bell)
         passed = passed[np.isfinite(passed).all(axis=-1)]
         if len(passed) < FILTERED_ROWS:
@@ -261,41 +251,42 @@ def regression(rig: Rig, system: AbstractSystem, data: Dataset) -> Regression | 
         return None
     held = not_identifiable(rig, system, data)
     uncertain = {name: of for name, of in rig.parameters.items() if of.std and name in rig.bodies and name not in held}
-    mean = {name: jnp.asarray(declared.mean, float) for name, declared in uncertain.items()}
+    mean, std = {n: jnp.asarray(of.mean, float) for n, of in uncertain.items()}, [of.std for of in uncertain.values()]
     positive = [of.mean > 0 and ("." not in n or n.endswith(("mass", "armature"))) for n, of in uncertain.items()]
     both = zip(uncertain.values(), positive, strict=True)
-    least = [max(-WITHIN, -of.mean / of.std) if above else -WITHIN for of, above in both]
+    least = np.asarray([max(-WITHIN, -of.mean / of.std) if above else -WITHIN for of, above in both])
     inputs = _by_joint(motion.torque, motion.direct[[joint - 1 for joint in system.joints]])
     maps = [filtered(_hats(motion.v[..., j]), taps) for j, taps in enumerate(motion.direct)]
     full = np.ones(inputs.shape[:2], bool)
-    problem = Regression(
-        system,
-        motion,
-        mean,
-        np.asarray([d.std for d in uncertain.values()]),
-        np.asarray(least),
-        full,
-        inputs,
-        [],
-        inputs,
-    )
+    problem = Regression(system, motion, mean, np.asarray(std), least, full, inputs, [], inputs)
     plain = problem.parts().reshape(3, *full.shape, -1)
     rows = np.all([np.isfinite(part).all(axis=-1) for part in (*plain, inputs, *maps)], axis=0)
     if rows.sum() < FILTERED_ROWS:
         return None
-    return problem._replace(
-        rows=rows, inputs=inputs[rows], friction=[_directions(one[rows]) for one in maps], plain=plain[:, rows]
-    )
+    friction = [_directions(one[rows]) for one in maps]
+    return problem._replace(rows=rows, inputs=inputs[rows], friction=friction, plain=plain[:, rows])
 
 
 def explanations(rig: Rig, problem: Regression) -> Iterator[Explanation]:
     """Every mistake that a log may have, corrected."""
-    yield from _gains(rig, problem)
+    names, system, eye = rig.input_columns, problem.system, np.eye(len(problem.size))
+    slopes = gains(problem)
+    if text := "; ".join(_in_other_units(rig, system, slopes)):
+        yield Explanation(problem.remains(slopes * problem.inputs), text)
     yield from _coasting(rig, problem)
-    yield from _swapped(rig, problem)
+    for i, j in itertools.combinations(range(len(names)), 2):
+        order = np.arange(len(names))
+        order[[i, j]] = j, i
+        text = f"{names[i]} and {names[j]} are swapped: exchange the columns"
+        yield Explanation(problem.remains(problem.inputs[:, order]), text)
     yield from _weightless(rig, problem)
-    yield from _mirrored(problem)
-    yield from _zeros(problem)
+    for name, rate, axis in zip(system.coordinates, system.rates, eye, strict=True):
+        text = f"{name} counts in the other direction than that of the machine: multiply it by -1, and {rate}"
+        yield Explanation(problem.remains(sign=1 - 2 * axis), text)
+    for joint, bias in _zeros(problem):
+        text = f"{system.coordinates[joint]} reads {bias:.3g} rad ({np.degrees(bias):.3g} degrees) more than it is: "
+        text += "subtract that" + ", or level the base, which is tilted by the opposite" * (joint == 0)
+        yield Explanation(problem.remains(shift=bias * eye[joint]), text, ruins=False)
 
 
 def gains(problem: Regression) -> Float[np.ndarray, " input"]:
@@ -336,21 +327,17 @@ def lag(problem: Regression, i: int) -> Lag:
     return Lag(shifts[best] + rows, std, remains)
 
 
-def _gains(rig: Rig, problem: Regression) -> Iterator[Explanation]:
+def _in_other_units(rig: Rig, system: AbstractSystem, slopes: Float[np.ndarray, " input"]) -> Iterator[str]:
     """Inputs of the wrong sign or in another unit."""
-    slopes, texts = gains(problem), []
-    for name, joint, gain in zip(rig.input_columns, problem.system.joints, slopes, strict=True):
-        factor, unit = abs(gain), problem.system.force_unit(joint)
-        same = 1 / UNIT_FACTOR < factor < UNIT_FACTOR
+    for name, joint, gain in zip(rig.input_columns, system.joints, slopes, strict=True):
+        same = 1 / UNIT_FACTOR < abs(gain) < UNIT_FACTOR
         if same and gain < 0:
-            texts.append(f"{name} has the wrong sign (its motor gain is {gain:.3g}): multiply it by -1")
-        elif not same and factor > 0:
-            sign = "of the wrong sign and " if gain < 0 else ""
-            text = f"{name} is {sign}in another unit: multiply it by {gain:.3g} to have {unit}"
-            text += " (a current, per mille of a rated torque, a torque before the gear?)"
-            texts.append(f"{text}; or masses and lengths are not in kg and m")
-    if texts:
-        yield Explanation(problem.remains(gains=slopes), "; ".join(texts))
+            yield f"{name} has the wrong sign (its motor gain is {gain:.3g}): multiply it by -1"
+        elif not same and gain != 0:
+            wrong = "of the wrong sign and " if gain < 0 else ""
+            text = f"{name} is {wrong}in another unit: multiply it by {gain:.3g} to have {system.force_unit(joint)} ("
+            text += "a current, per mille of a rated torque, a torque before the gear?)"
+            yield f"{text}; or masses and lengths are not in kg and m"
 
 
 def _coasting(rig: Rig, problem: Regression) -> Iterator[Explanation]:
@@ -358,21 +345,10 @@ def _coasting(rig: Rig, problem: Regression) -> Iterator[Explanation]:
     motion = problem.motion
     names = [name for i, name in enumerate(rig.input_columns) if np.any((motion.coasting != motion.torque)[..., i])]
     if names:
-        text = (
-            f'{" and ".join(names)}: at 0 V the drive does not brake, it coasts, and kind = "voltage" has its back-EMF'
-        )
-        text += " there, too: set the driver to brake, or leave rows at 0 V out"
+        text = f'{" and ".join(names)}: at 0 V the drive does not brake, it coasts, and kind = "voltage" has its '
+        text += "back-EMF there, too: set the driver to brake, or leave rows at 0 V out"
         inputs = _by_joint(motion.coasting, motion.direct[[joint - 1 for joint in problem.system.joints]])[problem.rows]
-        yield Explanation(problem._replace(inputs=inputs).remains(), text, ruins=False)
-
-
-def _swapped(rig: Rig, problem: Regression) -> Iterator[Explanation]:
-    """Two inputs, each in the place of the other."""
-    names = rig.input_columns
-    for i, j in itertools.combinations(range(len(names)), 2):
-        order = list(range(len(names)))
-        order[i], order[j] = j, i
-        yield Explanation(problem.remains(order=order), f"{names[i]} and {names[j]} are swapped: exchange the columns")
+        yield Explanation(problem.remains(inputs), text, ruins=False)
 
 
 def _weightless(rig: Rig, problem: Regression) -> Iterator[Explanation]:
@@ -384,19 +360,9 @@ def _weightless(rig: Rig, problem: Regression) -> Iterator[Explanation]:
     without = (np.abs(share) < carried) & (np.std(weight, axis=0) > 0)
     names = [name for name, joint in zip(rig.input_columns, problem.system.joints, strict=True) if without[joint - 1]]
     if names:
-        text = (
-            f"{' and '.join(names)}: the gravity of the declared bodies is not in it: log the whole torque of the motor"
-        )
-        text += ", with what a controller adds against gravity; or a spring or counterweight bears it"
+        text = f"{' and '.join(names)}: the gravity of the declared bodies is not in it: log the whole torque of the "
+        text += "motor, with what a controller adds against gravity; or a spring or counterweight bears it"
         yield Explanation(problem.remains(gravity=1.0 - without), text, ruins=False)
-
-
-def _mirrored(problem: Regression) -> Iterator[Explanation]:
-    """A coordinate that counts in the other direction."""
-    system = problem.system
-    for name, rate, axis in zip(system.coordinates, system.rates, np.eye(len(problem.size)), strict=True):
-        text = f"{name} counts in the other direction than that of the machine: multiply it by -1, and {rate}"
-        yield Explanation(problem.remains(sign=1 - 2 * axis), text)
 
 
 TURNS = 5
@@ -404,21 +370,17 @@ TURNS = 5
 hinge, since M and c are quadratic in rotations and g is linear."""
 
 
-def _zeros(problem: Regression) -> Iterator[Explanation]:
-    """An angle that reads too much; the best one follows from torques at a few."""
+def _zeros(problem: Regression) -> Iterator[tuple[int, float]]:
+    """Joints with an angle, and what it reads too much at best [rad], which follows from torques at a few."""
     applied, tried = problem.applied(problem.inputs), 2 * np.pi / TURNS * np.arange(TURNS)
     waves = lambda b: np.stack([np.ones_like(b), np.cos(b), np.sin(b), np.cos(2 * b), np.sin(2 * b)], axis=-1)  # noqa: E731
     fine = np.linspace(-np.pi, np.pi, 3601)
-    for joint, axis in enumerate(np.eye(len(problem.size))):
-        if not problem.system.angles[joint]:
-            continue
+    for joint in np.flatnonzero(problem.system.angles):
+        axis = np.eye(len(problem.size))[joint]
         errors = [problem.beyond(problem.parts(shift=b * axis).sum(axis=0) - applied).ravel() for b in tried]
         amplitudes = np.linalg.solve(waves(tried), np.stack(errors))
         squares = np.einsum("bi,ij,bj->b", waves(fine), amplitudes @ amplitudes.T, waves(fine))
-        bias, name = fine[np.argmin(squares)], problem.system.coordinates[joint]
-        text = f"{name} reads {bias:.3g} rad ({np.degrees(bias):.3g} degrees) more than it is: subtract that"
-        text += ", or level the base, which is tilted by the opposite" if joint == 0 else ""
-        yield Explanation(problem.remains(shift=bias * axis), text, ruins=False)
+        yield int(joint), float(fine[np.argmin(squares)])
 
 
 def mistakes(found: Iterable[Explanation], plain: Float[np.ndarray, " dof"]) -> list[Explanation]:
@@ -428,11 +390,11 @@ def mistakes(found: Iterable[Explanation], plain: Float[np.ndarray, " dof"]) -> 
     """
     total = lambda one: float(np.sum(np.log(np.maximum(one.remains, SMALLEST_MISFIT / 10))))  # noqa: E731
     ranked = sorted([Explanation(plain), *found], key=total)
-    best, explained = ranked[0], (ranked[0].remains <= LARGEST_REMAINDER * plain) & (ranked[0].remains <= UNEXPLAINED)
+    explained = (ranked[0].remains <= LARGEST_REMAINDER * plain) & (ranked[0].remains <= UNEXPLAINED)
     if not np.any(explained & (plain > SMALLEST_MISFIT)):
         return []
     tied = 1.1  # ratio of the unexplained of two corrections up to which both mistakes are named
-    return [one for one in ranked if total(one) <= total(best) + len(plain) * math.log(tied)]
+    return [one for one in ranked if total(one) <= total(ranked[0]) + len(plain) * math.log(tied)]
 
 
 @eqx.filter_jit

@@ -1,7 +1,7 @@
 """A fit as the prior of further logs: its numbers, friction, noise and laws in the place of what rig.toml declares."""
 
 import dataclasses
-from collections.abc import Iterator
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -29,34 +29,30 @@ def differences(fit: Rig, rig: Rig) -> list[str]:
     """
     if fit.equations or rig.equations:
         raise DataError(f"rig {rig.name!r} is written as equations; start from a fit of a machine with joints")
-    lines = list(_differing(_declared(fit), _declared(rig)))
+    old, new = _declared(fit), _declared(rig)
+    lines = {
+        key: f"{key} is {_text(old.get(key))} in the fit and {_text(new.get(key))} here"
+        for key in {**old, **new}
+        if old.get(key) != new.get(key)
+    }
     # keys that must be the same, or the fit is of another machine
-    same = ("system", "friction", "input_columns", "input_joints", "dt", "measured", "machine", "equations")
-    foreign = [line for key, line in lines if key in same]
-    if foreign:
+    same = ("system", "friction", "input_columns", "input_joints", "dt", "measured", "machine")
+    if foreign := [line for key, line in lines.items() if key in same]:
         raise DataError(f"rig {rig.name!r} is not that of the fit: {'; '.join(foreign)}")
-    return [line for _, line in lines]
+    return list(lines.values())
 
 
-def _declared(rig: Rig) -> dict:
-    """All declarations; of a machine file what it holds, wherever it is."""
-    whole = dataclasses.asdict(rig)
-    return whole | ({"machine": str(unpacked(rig.machine)._replace(file=""))} if rig.machine else {})
-
-
-def _differing(fit: dict, rig: dict) -> Iterator[tuple[str, str]]:
-    for key in (key for key in fit if key not in OF_LOGS and fit[key] != rig[key]):
-        old, new = fit[key], rig[key]
-        if isinstance(old, dict) and isinstance(new, dict):
-            for name in (name for name in {**old, **new} if old.get(name) != new.get(name)):
-                yield key, f"{name} of {key} is {_text(old.get(name))} in the fit and {_text(new.get(name))} here"
-        else:
-            yield key, f"{key} is {_text(old)} in the fit and {_text(new)} here"
+def _declared(rig: Rig) -> dict[str, Any]:
+    """Declarations by their keys; of a machine file what it holds, wherever it is."""
+    out: dict[str, Any] = {}
+    for name in (field.name for field in dataclasses.fields(rig) if field.name not in OF_LOGS):
+        value = getattr(rig, name)
+        value = str(unpacked(value)._replace(file="")) if name == "machine" and value else value
+        out |= {f"{key} of {name}": one for key, one in value.items()} if isinstance(value, dict) else {name: value}
+    return out
 
 
 def _text(value) -> str:
-    if isinstance(value, dict) and set(value) == {"mean", "std"}:
-        return f"{value['mean']:g} ± {value['std']:g}"
     text = "not declared" if value is None else str(value)
     return text if len(text) < 60 else "another"
 

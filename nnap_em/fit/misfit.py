@@ -86,19 +86,17 @@ class Misfit(NamedTuple):
     @property
     def document(self) -> dict[str, Any]:
         """The entry of report.json."""
-        return {"text": self.text, "useless": self.useless, "readings": [one._asdict() for one in self.readings]}
+        return self._asdict() | {"readings": [one._asdict() for one in self.readings]}
 
 
 def misfit(rows: Sequence[tuple], *, settled: bool = True) -> Misfit:
     """The word on a fit with this accuracy, of the reading that is predicted worst."""
-    every = [Accuracy._make(row) if settled else Accuracy._make(row)._replace(pushed=0.0) for row in rows]
+    every = tuple(Accuracy._make(row) if settled else Accuracy._make(row)._replace(pushed=0.0) for row in rows)
     if useless := [one.sentence for one in every if one.useless]:
-        text = f"The fit does not describe the motion, do not use it: {'; '.join(useless)}."
-        return Misfit(text, True, tuple(every))
+        return Misfit(f"The fit does not describe the motion, do not use it: {'; '.join(useless)}.", True, every)
     worst = max(every, key=lambda one: one.noises, default=None)
-    if worst is None or worst.noises < BEYOND_NOISE:
-        return Misfit("", False, tuple(every))
-    return Misfit(f"Something is missing in the model: {worst.sentence}.", False, tuple(every))
+    missing = worst is not None and worst.noises >= BEYOND_NOISE
+    return Misfit(f"Something is missing in the model: {worst.sentence}." if missing else "", False, every)
 
 
 def ahead(
@@ -110,8 +108,8 @@ def ahead(
     rows = starts.starts(y.shape[1])
     change = np.stack([y[:, rows + age] - y[:, rows] for age in starts.ages], axis=2)
     kick, moving = np.exp(0.5 * np.asarray(model.log_q)), measure_scales(rig, model.system, data).acceleration
-    pushed = {joint: float(kick[dof + joint] / rig.dt / moving[joint]) for joint in range(dof)}
-    of = [pushed.get(model.measured[place] % dof, 0.0) if model.measured[place] < 2 * dof else 0.0 for place in places]
+    pushed = [float(kick[dof + joint] / rig.dt / moving[joint]) for joint in range(dof)]
+    of = [pushed[model.measured[place] % dof] if model.measured[place] < 2 * dof else 0.0 for place in places]
     return _rows(rig, model, data, places, [age * rig.dt for age in starts.ages], (error, change), of)
 
 
@@ -152,18 +150,13 @@ class Moved(NamedTuple):
     @property
     def sentence(self) -> str:
         """Number, declaration and meaning."""
-        value = f"{self.name} = {self.value:.4g} {self.unit}".strip()
-        return (
-            f"{value} is {abs(self.distance):.1f} std from what is declared ({self.declared:.4g}): something is "
-            "missing in the model, or rig.toml is wrong."
-        )
+        text = f"{self.name} = {self.value:.4g} {self.unit}".strip() + f" is {abs(self.distance):.1f} std from what is "
+        return f"{text}declared ({self.declared:.4g}): something is missing in the model, or rig.toml is wrong."
 
 
 def moved(rig: Rig, prior: ParameterPrior, model: StateSpaceModel) -> list[Moved]:
     """Numbers of the rig that the fit has moved by more than `LEFT` of their declared std, the farthest first."""
-    if not prior.declared:
-        return []
-    z = np.asarray(prior.read(model))[: len(prior.declared)]
+    z = np.asarray(prior.read(model))[: len(prior.declared)] if prior.declared else ()
     numbers = zip(prior.declared, z, np.asarray(prior.mean), np.asarray(prior.std), strict=False)
     far = [Moved(n, float(m + s * d), float(m), float(d), rig.unit(n)) for n, d, m, s in numbers if abs(d) > LEFT]
     return sorted(far, key=lambda one: -abs(one.distance))

@@ -1,18 +1,15 @@
-"""Rates that are read beside their coordinates: scale, lag and averaging of what should be a derivative."""
+"""Rates that are read beside their coordinates: scale and lag of what should be a derivative."""
 
-from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
-from ..data.dataset import Dataset
 from ..data.noise import reading_noise
-from ..data.rig import Rig
 from .inverse_dynamics import filtered
 
 MISREAD = 0.01
-"""Share of a rate (root mean square) from which on its scale, lag or averaging is reported, as friction and inertia
+"""Share of a rate (root mean square) from which on its scale or lag is reported, as friction and inertia
 are off by as much: half a row late is 0.03 to 0.09 on real double pendulums at 100 Hz, whose rates are off by 0.003."""
 SURE = 5.0
 """Standard errors from which on they are reported; these come from as few as `FEWEST` pieces."""
@@ -25,22 +22,21 @@ NOISE = 0.3
 
 
 class Timing(NamedTuple):
-    """A rate w(t) = scale (p + width^2 / 24 p'')(t - late), with p the derivative of its coordinate."""
+    """A rate w(t) = scale p(t - late), with p the derivative of its coordinate."""
 
     scale: float
     late: float
     """Lag of the rate after the coordinate [s]."""
-    width: float
-    """Time over which a mean smooths as much [s]; negative where the coordinate is the smoother of the two."""
-    wrong: tuple[bool, bool, bool]
-    """True where scale, lag and averaging change the rate by `MISREAD`, and are `SURE`."""
+    wrong: tuple[bool, bool]
+    """True where scale and lag change the rate by `MISREAD`, and are `SURE`."""
 
 
 def timing(y: Float[np.ndarray, "seq time"], rate: Float[np.ndarray, "seq time"], dt: float) -> Timing | None:
-    """Scale, lag and averaging of `rate` beside its coordinate `y`; None where the logs hardly show them.
+    """Scale and lag of `rate` beside its coordinate `y`; None where the logs hardly show them.
 
     Both pass one window.  The row of the highest correlation, which noise does not bend, is refined by regression on
-    the derivatives there, with standard errors by the jackknife over pieces [Tukey 1958, Ann. Math. Stat. 29, 614].
+    the derivatives there (the third takes up a mean), with standard errors by the jackknife over pieces [Tukey 1958,
+    Ann. Math. Stat. 29, 614].
     """
     y, rate = bridged(y), bridged(rate)
     both = np.isfinite(y) & np.isfinite(rate)
@@ -79,41 +75,17 @@ def timing(y: Float[np.ndarray, "seq time"], rate: Float[np.ndarray, "seq time"]
     whole = np.sum(sums, axis=0)
     value, *others = (_moments(part, lag) for part in (whole, *(whole - part for part in sums)))
     std = np.sqrt(len(sums) - 1) * np.std(others, axis=0)
-    size = np.sqrt(np.abs(np.diag(whole)[:3] / whole[0, 0])) * (1, 1, 0.5)
-    off = np.abs(value - (1, 0, 0))
-    scale, late, spread = map(float, value)
+    size = np.sqrt(np.abs(np.diag(whole)[:2] / whole[0, 0]))
+    off = np.abs(value - (1, 0))
     wrong = (off * size > MISREAD) & (off > SURE * std)
-    return Timing(scale, late * dt, float(np.copysign(np.sqrt(12 * abs(spread)) * dt, spread)), tuple(wrong.tolist()))
+    return Timing(float(value[0]), float(value[1]) * dt, tuple(wrong.tolist()))
 
 
-def _moments(sums: Float[np.ndarray, "5 5"], lag: int) -> Float[np.ndarray, "3"]:
-    """Scale, lag [rows] and variance [rows^2] of the filter between both, by sums of products about `lag`."""
+def _moments(sums: Float[np.ndarray, "5 5"], lag: int) -> Float[np.ndarray, "2"]:
+    """Scale and lag [rows] of the filter between both, by sums of products about `lag`."""
     unit = np.sqrt(np.abs(np.diag(sums)[:4])) + 1e-300
     by = np.linalg.lstsq(sums[:4, :4] / np.outer(unit, unit), sums[:4, 4] / unit, rcond=None)[0] / unit
-    shift = -by[1] / by[0]
-    return np.array([by[0], lag + shift, 2 * by[2] / by[0] - shift**2])
-
-
-def timings(rig: Rig, data: Dataset) -> Iterator[tuple[bool, str]]:
-    """A sentence for every rate that is read beside its coordinate, and True where it is not its derivative."""
-    for name, rate in rig.pairs():
-        y, w = (np.asarray(data.y)[..., rig.measured.index(column)] for column in (name, rate))
-        found = timing(y, w, rig.dt)
-        if found is None:
-            continue
-        scaled, shifted, smoothed = found.wrong
-        lag = f"{abs(found.late):.3g} s ({abs(found.late) / rig.dt:.3g} rows)"
-        late, first = (rate, f"the derivative of {name}") if found.late > 0 else (name, rate)
-        smooth = rate if found.width > 0 else name
-        worse = late if shifted else smooth
-        remarks = (
-            (scaled, f"{rate} is {found.scale:.4g} times the derivative of {name}: correct the unit or gear of one"),
-            (shifted, f"{late} is {lag} later than {first}"),
-            (smoothed, f"{smooth} is as smooth as a mean over {abs(found.width):.2g} s"),
-            (shifted or smoothed, f"take {worse} out of [measurement] columns, or log both unfiltered, of one moment"),
-        )
-        text = "; ".join(remark for holds, remark in remarks if holds)
-        yield bool(text), text or f"{rate} is the derivative of {name}, {lag} {'late' if found.late > 0 else 'early'}"
+    return np.array([by[0], lag - by[1] / by[0]])
 
 
 def bridged(y: Float[np.ndarray, "seq time"]) -> Float[np.ndarray, "seq time"]:

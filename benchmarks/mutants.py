@@ -337,7 +337,7 @@ error of an angle not wrapped
 variance for a standard deviation in predicted kicks
 - jnp.exp(0.5 * model.log_q)
 + jnp.exp(model.log_q)
-## test_predict.py::test_uncertain_friction_widens_what_is_smoothed_where_nothing_is_read
+## test_predict.py::test_uncertain_friction_widens_what_is_predicted_and_what_is_smoothed_where_nothing_is_read
 smoothed states that a model does not widen
 - path._replace(cov=path.cov + model_cov)
 + path._replace(cov=path.cov + 0.0 * model_cov)

@@ -5,8 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from blackbox import GradientMStep, NetworkModel, build_network, forecast, gather_pairs, squared_error
-from helpers import optimised
+from blackbox import GradientMStep, NetworkModel, build_network, forecast
 
 from nnap_em.data.dataset import Dataset
 from nnap_em.em.loop import Schedule, e_step, fit, start_state
@@ -54,7 +53,7 @@ _smoother = ExtendedKalmanSmoother(StartBank((1, 1)))
 _e_step = eqx.filter_jit(e_step)
 
 
-@pytest.mark.slow  # fast: test_loss_falls_to_that_of_the_true_transition_on_true_states
+@pytest.mark.slow  # fast: test_forecast_of_a_linear_system_has_the_moments_of_the_kalman_prediction
 def test_a_fitted_network_predicts_as_the_system_itself():
     truth = _oscillator()
     data, _ = _record(truth, 24, 150, key=jax.random.key(0))
@@ -76,36 +75,6 @@ def test_a_fitted_network_predicts_as_the_system_itself():
     assert np.all(jnp.sqrt(jnp.mean(each**2, axis=(0, 1))) < np.sqrt(0.05) * np.exp(0.5 * truth.log_q))
     for log in ("log_r", "log_q"):
         np.testing.assert_allclose(np.exp(0.5 * (getattr(model, log) - getattr(truth, log))), 1.0, rtol=0.25)
-
-
-@pytest.fixture(scope="module")
-def smoothed():
-    """Logs of the oscillator, and their posterior by the oscillator itself."""
-    truth = _oscillator()
-    data, _ = _record(truth, 12, 150, key=jax.random.key(4))
-    return truth, data, _e_step(_as_model(truth), data, _smoother, key=jax.random.key(0))
-
-
-def test_loss_falls_to_that_of_the_true_transition_on_true_states(smoothed):
-    """Posterior nodes that are the true states: the M-step is plain regression with a known residual."""
-    truth, data, posterior = smoothed
-    pairs = gather_pairs(posterior, data, jnp.ones(12, bool))
-    model = build_network(data, (0, 1), 2, truth.dt, key=jax.random.key(5), width=16)
-    with optimised():
-        mlp = GradientMStep(jax.random.key(6), steps=1500).descend(model, pairs)
-    new = eqx.tree_at(lambda m: m.mlp, model, mlp)
-    before, after, floor = (jnp.sum(squared_error(m, pairs)) for m in (model, new, truth))
-    assert after < 0.5 * before
-    assert after < 1.1 * floor
-
-
-def test_lost_sequences_change_nothing(smoothed):
-    truth, data, posterior = smoothed
-    used = jnp.arange(12) < 11
-    spoilt = posterior._replace(prev=posterior.prev.at[11].set(jnp.nan), next=posterior.next.at[11].set(jnp.nan))
-    some = squared_error(truth, gather_pairs(spoilt, data, used))
-    cut = jax.tree.map(lambda a: a[:11], (posterior, data))
-    np.testing.assert_allclose(some, squared_error(truth, gather_pairs(*cut, used[:11])), rtol=1e-12)
 
 
 def test_forecast_of_a_linear_system_has_the_moments_of_the_kalman_prediction():

@@ -13,7 +13,7 @@ from nnap_em import diagnose, findings, identify
 from nnap_em.data.dataset import DataError
 from nnap_em.data.rig import Declared
 from nnap_em.diagnosis.change import changes
-from nnap_em.diagnosis.outcome import Diagnosis, Step, Suspect
+from nnap_em.diagnosis.outcome import Diagnosis
 from nnap_em.diagnosis.verdict import KEEP, RISEN, veto
 from nnap_em.effects.position import TorsionalSpring
 from nnap_em.em.recorded import Risen, deleted, level, risen
@@ -119,21 +119,18 @@ def test_a_law_that_was_missing_before_is_no_change():
 
 def test_a_law_that_the_recordings_of_the_fit_show_as_well_is_no_change():
     good = {"possible": True, "certainty": 50.0, "amplitude": 50.0, "removed": 0.5, "floor": 0.15, "complexity": 0}
-    assert veto(**good) is None
-    assert veto(**good, before=KEEP * 0.15 - 0.01) is None
+    assert veto(**good) is veto(**good, before=KEEP * 0.15 - 0.01) is None
     assert veto(**good, before=KEEP * 0.15 + 0.01).code == "before"
 
 
 def test_where_nothing_explains_it_the_errors_decide():
-    last = Step(150, (), (), None, 1, suspects=(Suspect(("payload", 1, None, ()), 0.1, 0.0),))
-    for p, least, text, ending in (
-        (0.9 * RISEN, 1e-3, "Something changed", "where chance removes less than 1%."),
-        (1.1 * RISEN, 0.9 * RISEN, "Nothing changed", "(p = 0.011)."),
-        (1.1 * RISEN, 1.1 * RISEN, "Nothing is certain to have changed", "where chance removes less than 1%."),
+    for p, least, text in (
+        (0.9 * RISEN, 1e-3, "Something changed"),
+        (1.1 * RISEN, 0.9 * RISEN, "Nothing changed"),
+        (1.1 * RISEN, 1.1 * RISEN, "Nothing is certain to have changed"),
     ):
-        outcome = Diagnosis(None, None, (), (last,), change=True, risen=Risen(2.0, p, least))  # type: ignore[arg-type]
-        sentence = changes(outcome, [])
-        assert sentence.startswith(text) and sentence.endswith(ending) and "errors are 2.0 times" in sentence
+        outcome = Diagnosis(None, None, (), (), change=True, risen=Risen(2.0, p, least))  # type: ignore[arg-type]
+        assert changes(outcome, []).startswith(text) and "errors are 2.0 times" in changes(outcome, [])
     assert "not at hand" in changes(outcome._replace(risen=None), [])
 
 

@@ -12,29 +12,14 @@ from nnap_em.data.dataset import Dataset
 from nnap_em.data.rig import Declared, Rig
 from nnap_em.em.build import build_system
 from nnap_em.fit.check import dynamics
-from nnap_em.fit.inverse_dynamics import (
-    LARGEST_REMAINDER,
-    SMALLEST_MISFIT,
-    Explanation,
-    mistakes,
-    regression,
-)
+from nnap_em.fit.inverse_dynamics import LARGEST_REMAINDER, SMALLEST_MISFIT, Explanation, mistakes, regression
 
 Log = tuple[Rig, Dataset]
 SEQUENCES, ROWS, DT = 2, 401, 0.01
+ARM = ("m1", "m2", "l1", "l2", "lc1", "lc2", "I1", "I2", "g")
 NUMBERS = {
     "pendulum": {"m": 0.5, "lc": 0.2, "I": 0.004, "g": 9.81},
-    "acrobot": {
-        "m1": 1.0,
-        "m2": 0.6,
-        "l1": 0.3,
-        "l2": 0.25,
-        "lc1": 0.15,
-        "lc2": 0.12,
-        "I1": 0.01,
-        "I2": 0.005,
-        "g": 9.81,
-    },
+    "acrobot": dict(zip(ARM, (1.0, 0.6, 0.3, 0.25, 0.15, 0.12, 0.01, 0.005, 9.81), strict=True)),
 }
 
 
@@ -65,16 +50,11 @@ def log(request) -> Log:
     """Sums of sinusoids, the torques that they need with Stribeck friction, and readings with 2 mrad of noise."""
     name, rng = request.param, np.random.default_rng(0)
     joints = (1,) if name == "pendulum" else (1, 2)
-    size, rate, phase = rng.uniform(
-        [[0.2], [1.0], [0.0]], [[0.6], [5.0], [6.3]], (SEQUENCES * len(joints), 3, 5)
-    ).swapaxes(0, 1)
+    waves = rng.uniform([[0.2], [1.0], [0.0]], [[0.6], [5.0], [6.3]], (SEQUENCES * len(joints), 3, 5))
+    size, rate, phase = waves.swapaxes(0, 1)[..., None]
 
     def motion(t: np.ndarray, order: int) -> np.ndarray:
-        waves = (
-            size[..., None]
-            * rate[..., None] ** order
-            * np.sin(rate[..., None] * t + phase[..., None] + order * np.pi / 2)
-        )
+        waves = size * rate**order * np.sin(rate * t + phase + order * np.pi / 2)
         return np.moveaxis(waves.sum(axis=1).reshape(SEQUENCES, len(joints), -1), 1, 2)
 
     t = DT * np.arange(ROWS)
@@ -130,13 +110,12 @@ def test_a_log_without_a_mistake_is_explained(log):
 @pytest.mark.parametrize("case", CASES)
 def test_a_mistake_is_named_with_its_hint(log, case):
     change, words = CASES[case]
-    rig, _ = log
-    for j, (u, q) in enumerate(zip(rig.input_columns, ("theta1", "theta2"), strict=False)):
-        (text,) = _warnings(rig, change(log, j))
+    for j, (u, q) in enumerate(zip(log[0].input_columns, ("theta1", "theta2"), strict=False)):
+        (text,) = _warnings(log[0], change(log, j))
         assert words.format(u=u, q=q) in text
 
 
-@pytest.mark.parametrize("degrees", [2.0, 10.0, 90.0, -170.0])
+@pytest.mark.parametrize("degrees", [2.0, -170.0])
 def test_a_zero_that_is_off_is_named_with_its_angle(log, degrees):
     for j in range(log[1].y.shape[-1]):
         (text,) = _warnings(log[0], _shift(degrees)(log, j))
@@ -212,22 +191,19 @@ def test_a_hidden_coordinate_or_another_kind_of_input_says_nothing(log):
     assert regression(servo, build_system(rig), data) is None
 
 
-@pytest.mark.parametrize(
-    ("plain", "left", "named"),
-    [
-        (0.5, 0.9 * LARGEST_REMAINDER * 0.5, True),
-        (0.5, 1.1 * LARGEST_REMAINDER * 0.5, False),
-        (2.0, 0.19, True),
-        (2.0, 0.21, False),  # more than a fifth stays unexplained
-        (1.1 * SMALLEST_MISFIT, 0.0, True),
-        (0.9 * SMALLEST_MISFIT, 0.0, False),
-    ],
-)
-def test_a_mistake_must_explain_much_of_what_is_unexplained(plain, left, named):
-    found = mistakes([Explanation(np.asarray([left]), "it")], np.asarray([plain]))
-    assert [one.text for one in found] == ["it"] * named
+EXPLAINED = [  # unexplained as it is and with the mistake corrected, and whether it is named
+    (0.5, 0.9 * LARGEST_REMAINDER * 0.5, True),
+    (0.5, 1.1 * LARGEST_REMAINDER * 0.5, False),
+    (2.0, 0.19, True),
+    (2.0, 0.21, False),  # more than a fifth stays unexplained
+    (1.1 * SMALLEST_MISFIT, 0.0, True),
+    (0.9 * SMALLEST_MISFIT, 0.0, False),
+]
 
 
-def test_mistakes_that_explain_the_same_are_listed_together():
+def test_a_mistake_must_explain_much_of_what_is_unexplained_and_those_that_explain_the_same_are_listed_together():
+    for plain, left, named in EXPLAINED:
+        found = mistakes([Explanation(np.asarray([left]), "it")], np.asarray([plain]))
+        assert [one.text for one in found] == ["it"] * named
     one, same, worse = (Explanation(np.asarray([left]), text) for left, text in ((0.1, "a"), (0.105, "b"), (0.12, "c")))
     assert [entry.text for entry in mistakes([worse, same, one], np.ones(1))] == ["a", "b"]

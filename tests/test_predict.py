@@ -7,18 +7,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 
-from nnap_em.data.dataset import Dataset, stepped
+from nnap_em.data.dataset import Dataset
 from nnap_em.data.rig import Declared, Rig
 from nnap_em.fit.identify import Identified, begin, friction_table, phi_samples
 from nnap_em.fit.predict import Prediction, given_samples, horizon_errors, posterior_of, predict, smooth
 from nnap_em.model.simulate import simulate
 from nnap_em.model.state_space import Inputs, StateSpaceModel
 from nnap_em.numerics.gaussian import Gaussian
-from nnap_em.smoother.gaussian import CubatureSmoother
-from nnap_em.smoother.particle import ParticleSmoother
-from nnap_em.smoother.posterior import AbstractSmoother
 from nnap_em.systems.pendulum import Pendulum
 
 DT, ROWS, SAMPLES = 0.02, 80, 400
@@ -67,18 +63,10 @@ def _case(q: float, information: float) -> _Case:
     return _Case(problem._replace(state=problem.state._replace(model=model, best=model, hessian=hessian)), data, x)
 
 
-def test_given_rows_are_those_up_to_the_time():
-    t = jnp.asarray([[5.0, 5.1, 5.2, 5.3], [0.0, 0.1, 0.1, 0.1]])
-    data = Dataset(t, jnp.zeros((2, 4, 1)), jnp.zeros((2, 4, 1)), jnp.asarray([[True] * 4, [True, True, False, False]]))
-    np.testing.assert_array_equal(given_samples(data, 0.2), [[1, 1, 1, 0], [1, 1, 0, 0]])  # clocks may start anywhere
-
-
 def test_without_noise_the_prediction_is_the_integral():
     case = _case(q=1e-7, information=1e20)
     prediction = predict(case.fitted, case.data, GIVEN, key=KEY, samples=SAMPLES)
-    model = case.fitted.model
-    last = int(np.sum(given_samples(case.data, GIVEN)[0])) - 1
-    ahead = np.asarray(prediction.ahead)
+    model, last, ahead = case.fitted.model, round(GIVEN / DT), np.asarray(prediction.ahead)
     np.testing.assert_array_equal(ahead, np.arange(ROWS)[None].repeat(3, 0) > last)
     x, path = prediction.mean[:, last], []
     step = jax.jit(jax.vmap(model.transition))
@@ -91,18 +79,6 @@ def test_without_noise_the_prediction_is_the_integral():
     assert np.all(np.abs(prediction.mean[:, last + 1 :] - path) < 4 * std / np.sqrt(SAMPLES) + 1e-5)
     assert np.all(np.abs(prediction.mean - case.x)[ahead] < 5 * np.asarray(prediction.std)[ahead])
     assert std.max() < 0.02
-
-
-def test_groups_of_sequences_and_rows_of_padding_change_nothing(monkeypatch):
-    """Each is smoothed and predicted alone where memory has room for one; padded rows change no number."""
-    case = _case(q=1e-2, information=1.0)
-    together = predict(case.fitted, case.data, GIVEN, key=KEY, samples=SAMPLES)
-    monkeypatch.setattr(AbstractSmoother, "room", 1)
-    single = predict(case.fitted, stepped(case.data, 99), GIVEN, key=KEY, samples=SAMPLES)
-    assert single.mean.shape[1] == 104
-    for a, b in zip(together, single, strict=True):
-        # rounding, in other programs, over 80 rows of a smooth motion
-        np.testing.assert_allclose(a, np.asarray(b)[:, :ROWS], rtol=1e-9, atol=1e-12)
 
 
 def test_std_grows_as_the_kicks_add_up():
@@ -128,30 +104,13 @@ def test_std_grows_as_the_kicks_add_up():
     assert total[-1] > 3 * total[last + 1] > 3 * total[last]
 
 
-def test_the_smoother_of_the_fit_is_the_one_that_smooths():
-    """A particle smoother gives the states of the Kalman smoother within their error, and says how it was sampled."""
-    case = _case(q=1e-2, information=1.0)
-    kalman = posterior_of(case.fitted, case.data)
-    drawn = case.fitted._replace(smoother=ParticleSmoother(CubatureSmoother(case.fitted.bank), num_paths=400))
-    posterior = posterior_of(drawn, case.data)
-    assert np.all(np.isinf(kalman.ess)) and np.all(np.asarray(posterior.ess) > 100)
-    std = np.sqrt(np.diagonal(np.asarray(kalman.state.cov), axis1=2, axis2=3))
-    # means of 400 paths through 300 particles: a standard error of 0.08, 480 of them
-    assert np.max(np.abs(np.asarray(posterior.state.mean - kalman.state.mean)) / std) < 5 * 0.08
-    np.testing.assert_array_equal(posterior_of(drawn, case.data).state.mean, posterior.state.mean)
-
-
-def test_uncertain_friction_widens_the_prediction():
-    cases = (_case(q=1e-5, information=information) for information in (1e20, 1e2))
-    sure, unsure = (predict(c.fitted, c.data, GIVEN, key=KEY, samples=SAMPLES).std[:, -1, 0] for c in cases)
-    assert np.all(np.asarray(unsure) > 1.5 * np.asarray(sure))
-
-
-def test_uncertain_friction_widens_what_is_smoothed_where_nothing_is_read():
-    sure, unsure = (_case(q=1e-5, information=i) for i in (1e20, 1.0))
-    blind = sure.data._replace(y=sure.data.y.at[:, 20:].set(jnp.nan))
-    certain = posterior_of(sure.fitted, blind).state.cov
-    known, wide = (smooth(case.fitted, blind).cov for case in (sure, unsure))
+def test_uncertain_friction_widens_what_is_predicted_and_what_is_smoothed_where_nothing_is_read():
+    cases = [_case(q=1e-5, information=information) for information in (1e20, 1.0)]
+    ahead = [predict(c.fitted, c.data, GIVEN, key=KEY, samples=SAMPLES).std[:, -1, 0] for c in cases]
+    assert np.all(np.asarray(ahead[1]) > 1.5 * np.asarray(ahead[0]))
+    blind = cases[0].data._replace(y=cases[0].data.y.at[:, 20:].set(jnp.nan))
+    certain = posterior_of(cases[0].fitted, blind).state.cov
+    known, wide = (smooth(case.fitted, blind).cov for case in cases)
     np.testing.assert_allclose(known, certain, rtol=1e-6)
     last, first = (np.asarray(wide / certain)[:, row, 0, 0] for row in (-1, 5))
     assert np.all(last > 100 * first)
@@ -198,7 +157,4 @@ def test_horizon_errors_are_plain_arithmetic():
             for k in range(ROWS)
             if valid[s, k] and not np.isnan(y[s, k, 0]) and round(GIVEN / DT) < k <= round((GIVEN + horizon) / DT)
         ]
-        if squares:
-            assert rms == pytest.approx(float(np.sqrt(np.mean(squares))), rel=1e-12)
-        else:
-            assert np.isnan(rms)
+        np.testing.assert_allclose(rms, np.sqrt(np.mean(squares)) if squares else np.nan, rtol=1e-12)

@@ -21,24 +21,23 @@ SWING = Rig("swing", "pendulum", BODY, True, ("u",), (1,), 0.02, "sequence", ("t
 ARM = {n: Declared(v, 0.1 * v if n[0] in "mI" else 0.0) for n, v in plant.SYSTEMS["acrobot"].parameters.items()}
 
 
-def _swinging(rig: Rig, scale: float = 1.0, torque: float = 0.0) -> Dataset:
-    """A pendulum of the declared body with viscous friction, all masses `scale` times as large."""
+def _swinging(rig: Rig) -> Dataset:
+    """A pendulum of the declared body with viscous friction, that nothing drives."""
     system = build_system(rig)
     m, lc, inertia, g = (float(getattr(system, name)) for name in ("m", "lc", "I", "g"))
     rng, rows = np.random.default_rng(0), 150
-    x, u = np.empty((4, rows, 2)), torque * np.sin(3 * rig.dt * np.arange(rows) + np.arange(4)[:, None])
+    x = np.empty((4, rows, 2))
     for s in range(4):
         x[s, 0] = rng.uniform(0.6, 1.4), 0.0
         q, v = x[s, 0]
         for k in range(1, rows):
             for _ in range(20):
-                force = u[s, k - 1] / scale - 0.02 * v - m * lc * g * math.sin(q)
-                v += rig.dt / 20 * force / (m * lc**2 + inertia)
+                v -= rig.dt / 20 * (0.02 * v + m * lc * g * math.sin(q)) / (m * lc**2 + inertia)
                 q += rig.dt / 20 * v
             x[s, k] = q, v
     y = x[..., :1] + 0.002 * rng.normal(size=x[..., :1].shape)
     t = np.tile(rig.dt * np.arange(rows), (4, 1))
-    return Dataset(*map(jnp.asarray, (t, u[..., None], y, np.ones(t.shape, bool))))
+    return Dataset(*map(jnp.asarray, (t, 0 * t[..., None], y, np.ones(t.shape, bool))))
 
 
 def test_the_most_closely_declared_mass_carries_the_scale():
@@ -49,20 +48,15 @@ def test_the_most_closely_declared_mass_carries_the_scale():
         held = holding(SWING, (known,))
         assert held.parameters[known] == Declared(BODY[known].mean, 0.0)
         assert not_identifiable(held, build_system(held), still) == ()
-
-
-def test_nothing_scales_the_machine_once_all_is_held_that_could():
-    """Where a length is uncertain too, mass and length together scale what is left."""
+    # where a length is uncertain too, mass and length together scale what is left
     rig = dataclasses.replace(SWING, parameters={**BODY, "lc": Declared(0.3, 0.05)})
-    still = _swinging(SWING)
     names = not_identifiable(rig, build_system(rig), still)
     assert len(names) == 2 and "I" not in names[:1]
-    held = holding(rig, names)
-    assert not_identifiable(held, build_system(held), still) == ()
 
 
-@pytest.mark.parametrize(("joints", "columns"), [((2,), ("u",)), ((), ())])
-def test_an_arm_with_an_idle_motor_or_none(joints, columns):
+@pytest.mark.parametrize("joints", [(2,), ()])
+def test_an_arm_with_an_idle_motor_or_none(joints):
+    columns = ("u",) * len(joints)
     rig = Rig("arm", "acrobot", ARM, True, columns, joints, 0.02, "sequence", ("theta1", "theta2"), {}, {})
     still = Dataset(np.zeros((2, 9)), np.zeros((2, 9, len(columns))), np.zeros((2, 9, 2)), np.ones((2, 9), bool))
     system = build_system(rig)

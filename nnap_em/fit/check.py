@@ -183,7 +183,7 @@ def _result(subject: str, text: str, errors: Mapping[str, object], warnings: Map
     """A result with the hints of those errors and warnings that hold."""
     mark = ERROR if any(errors.values()) else WARNING if any(warnings.values()) else OK
     hints = dict.fromkeys(hint for hint, holds in (*errors.items(), *warnings.items()) if holds)
-    return CheckResult(mark, subject, "; ".join(filter(None, [text, *hints])))
+    return CheckResult(mark, subject, "; ".join(part for part in (text, *hints) if part))
 
 
 def _amount(rig: Rig, data: Dataset, test: Logs | None) -> Iterator[CheckResult]:

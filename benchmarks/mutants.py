@@ -125,8 +125,8 @@ contrasts that only the network knows are tested
 + variance >= 0.0
 ## test_compare.py::test_errors_of_fits_that_differ_are_widened_to_the_difference
 errors are widened by the square of their ratio
-- math.sqrt(self.statistic / max(self.freedom, 1))
-+ self.statistic / max(self.freedom, 1)
+- np.sqrt(max(1.0, test.statistic / max(test.freedom, 1)))
++ max(1.0, test.statistic / max(test.freedom, 1))
 # comparison/compare.py
 ## test_compare.py::test_alarms_are_as_frequent_as_the_level_says
 changes that are not corrected for their number

@@ -509,11 +509,11 @@ autocovariance not over that of lag 0
 - np.maximum(pairs, 1.0) * (pairs[0] / sums[0]), pairs
 + np.maximum(pairs, 1.0), pairs
 # experiment/signals.py
-## test_design.py::test_inputs_keep_to_torque_and_its_change[chirp]
+## test_design.py::test_inputs_keep_to_torque_and_its_change
 a design that forgets the limit of torque
 - np.minimum(limits.high, rest + left)
 + rest + left + limits.high
-## test_design.py::test_inputs_keep_to_torque_and_its_change[steps]
+## test_design.py::test_inputs_keep_to_torque_and_its_change
 a design that forgets how fast torque may change
 - most, out = limits.rate * (t[1] - t[0])
 + most, out = 9 * limits.rate * (t[1] - t[0])
@@ -532,7 +532,7 @@ a friction band that counts at speed alone
 - np.mean(np.log(mean + 1e-30), axis=-1)
 + np.log(mean + 1e-30)[..., 0]
 # experiment/information.py
-## test_design.py::test_information_is_the_mean_square_of_the_score
+## test_design.py::test_information_along_the_logs_is_the_curvature_of_their_fit
 information of steps outside the data
 - jnp.where(linear.seq.active[:, None, None], jnp.concatenate(
 + jnp.where(~linear.seq.active[:, None, None], jnp.concatenate(

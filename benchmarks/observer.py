@@ -31,7 +31,6 @@ from nnap_em.fit.observer import RESTARTED, Observer, functions, observer, resta
 from nnap_em.fit.store import load, save
 from nnap_em.model.simulate import paper_experiment, paper_model
 from nnap_em.model.state_space import StateSpaceModel
-from nnap_em.smoother.kalman import CUBATURE
 
 NATIVE = "-march=native"
 
@@ -156,7 +155,7 @@ def main() -> int:
 
 def true_observer(fitted: Identified, truth: StateSpaceModel) -> Observer:
     """The observer of the model that made the logs."""
-    start, step = functions(truth, fitted.bank.angles, restart_prior(truth), 16, CUBATURE)
+    start, step = functions(truth, fitted.bank.angles, restart_prior(truth), 16)
     return observer(fitted)._replace(start=start, step=step)
 
 

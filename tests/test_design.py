@@ -1,38 +1,32 @@
 """Designed experiments: inputs inside their limits, information by another road, and what a fit then states."""
 
 import dataclasses
+import itertools
 import json
-import os
-from pathlib import Path
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import nnap, optimised, written_again
+from helpers import nnap, written_again
 from rigs import slide_logs, slide_rig
 
 import nnap_em
 from nnap_em.data.dataset import Dataset
 from nnap_em.data.limits import Bounds
-from nnap_em.data.logs import read_logs
 from nnap_em.data.rig import Rig, RigError, read_rig, write_rig
-from nnap_em.diagnosis.residual import names_of
 from nnap_em.errors import StoreError
-from nnap_em.experiment.criteria import Friction, Several, after, share
+from nnap_em.experiment.criteria import Criterion, after, share
 from nnap_em.experiment.experiment import design
-from nnap_em.experiment.information import Fit, columns_of, information, known, linearised
+from nnap_em.experiment.information import Fit, information, known
 from nnap_em.experiment.limits import DesignError, Limits, limits_of
 from nnap_em.experiment.play import Motions, allowed, motions
 from nnap_em.experiment.search import Effort
 from nnap_em.experiment.signals import FAMILIES, drawn, mutated, played
 from nnap_em.fit.identify import Identified, identify, parameter_table
 from nnap_em.fit.predict import drawn_paths
-from nnap_em.fit.store import read, save
-from nnap_em.numerics.gaussian import Gaussian
-from nnap_em.report.design import check_places, motion_figure, write_design
-from nnap_em.smoother.kalman import kalman_filter
+from nnap_em.fit.store import save
+from nnap_em.report.design import check_places, write_design
 from nnap_em.systems import specs
 
 LIMITS = Limits(
@@ -43,25 +37,19 @@ SMALL = Effort(pool=16, batch=16, rounds=2, tries=4)
 THREE = {"seconds": 2.4, "sequences": 3, "effort": SMALL}
 
 
-@pytest.mark.parametrize("family", range(len(FAMILIES)), ids=[f.__name__ for f in FAMILIES])
-def test_inputs_keep_to_torque_and_its_change(family):
+def test_inputs_keep_to_torque_and_its_change():
+    """Of every family, and of mutations, whose numbers stay between 0 and 1."""
     rng, t = np.random.default_rng(3), 0.01 * np.arange(301)
-    proposal = drawn(rng, 40, 2, 2)._replace(family=np.full(40, family))
-    for one in (proposal, mutated(rng, proposal, 0.5)):
-        u = played(one, LIMITS, t)
+    proposals = drawn(rng, 40, 2, 2)
+    other = mutated(rng, proposals, 0.5)
+    assert other.shape.min() >= 0 and other.shape.max() <= 1 and np.abs(other.shape - proposals.shape).mean() > 0.2
+    for proposal, family in itertools.product((proposals, other), range(len(FAMILIES))):
+        u = played(proposal._replace(family=np.full(40, family)), LIMITS, t)
         assert np.all(u >= LIMITS.low[None, None]) and np.all(u <= LIMITS.high[None, None])
         change = np.abs(np.diff(u[..., 0], axis=1))
         assert change.max() <= 0.01 * LIMITS.rate[0] * (1 + 1e-9)
         assert np.abs(u[:, [0, -1], 0]).max() <= 0.01 * LIMITS.rate[0] * (1 + 1e-9)  # from rest, and back to it
         assert np.ptp(u[..., 0], axis=1).max() > 0.3  # and they are used
-
-
-def test_mutations_stay_numbers_between_0_and_1_and_begin_at_the_parent():
-    rng = np.random.default_rng(0)
-    parent = drawn(rng, 30, 1, 4)
-    near, far = mutated(rng, parent, 1e-9), mutated(rng, parent, 3.0)
-    np.testing.assert_allclose(near.shape, parent.shape, atol=1e-7)
-    assert far.shape.min() >= 0 and far.shape.max() <= 1 and np.abs(far.shape - parent.shape).mean() > 0.2
 
 
 def test_covariance_after_more_information_is_that_of_the_sum_of_precisions():
@@ -87,7 +75,7 @@ def test_friction_near_rest_counts_as_much_as_all_the_rest():
     """Torques of a joint at rest and at speed, in units of its friction: each bandwidth to the power of a half."""
     std, weight = np.asarray([0.4, 0.1]), np.asarray([[[0.0, 1.0]], [[1.0, 0.0]]])
     fit = Fit(None, None, np.asarray([[0.0, 9.0]]), np.diag(std**2), np.eye(2))  # type: ignore[arg-type]
-    cost = Friction(fit, np.asarray([2.0]), weight).cost
+    cost = Criterion(fit, np.asarray([2.0]), weight).cost
     nothing, slow = (np.diag([expected, 0.0]) / std**2 for expected in (0.0, 8.0))
     np.testing.assert_allclose(np.exp(cost(nothing)), np.sqrt(0.2 * 0.05), rtol=1e-9)
     np.testing.assert_allclose(cost(nothing) - cost(slow), 0.5 * np.log(3.0), rtol=1e-9)  # eightfold more information
@@ -102,47 +90,15 @@ def slide(slide_fit) -> tuple[Rig, Dataset, Identified]:
     return slide_rig(), Dataset(*map(jnp.asarray, slide_logs(0))), slide_fit
 
 
-@pytest.fixture(scope="module")
-def path(slide) -> jax.Array:
-    """Smoothed states of the logs."""
-    _, data, fitted = slide
-    return nnap_em.smooth(fitted, data).mean
-
-
-def test_information_is_the_mean_square_of_the_score(slide, path):
-    """Fisher's identity, by brute force: readings drawn from the linearised model, their likelihood differentiated.
-
-    The force of the node near a usual speed moves; all else stays, and the model is linear about the path.
-    """
-    known_fit, seq, x = known(slide[-1]), jax.tree.map(lambda a: a[0], slide[1]), path[0]
-    model, speed = known_fit.model, np.median(np.abs(path[..., 1]))
-    place = int(np.argmin(np.abs(np.asarray(known_fit.nodes[0]) - speed)))
-
-    @eqx.filter_jit
-    def slope_of(known_fit, seq, x):
-        linear, _, wide = linearised(known_fit, seq, x)
-        column, start = columns_of(known_fit, linear, wide)[..., place], Gaussian(x[0], model.start.cov)
-
-        def innovations(amount):
-            affine = linear.affine._replace(offset=linear.affine.offset + amount * column)
-            return kalman_filter(model.log_q, model.log_r, start, affine, linear.reading, linear.seq).innovation
-
-        return jax.jacfwd(innovations)(jnp.zeros(()))
-
-    slope = slope_of(known_fit, seq, x)
-    expected = information(known_fit, slide[1], path[:, None])
-    np.testing.assert_allclose(expected[0, place, place], float(jnp.sum(slope**2)), rtol=1e-8)
-    assert expected[0, place, place] > 0
-
-
-def test_information_along_the_logs_is_the_curvature_of_their_fit(slide, path):
+def test_information_along_the_logs_is_the_curvature_of_their_fit(slide):
     """The fit linearises over the whole posterior, a design along one motion: they agree to a few percent."""
     _, data, fitted = slide
-    total = information(known(fitted), data, path[:, None]).sum(axis=0)
+    total = information(known(fitted), data, nnap_em.smooth(fitted, data).mean[:, None]).sum(axis=0)
     weights = fitted.m_step.weights(fitted.model)
     hessian = jnp.asarray(total) + weights.prior_precision(fitted.model.unknown)
-    std, fits = (float(np.sqrt(np.linalg.inv(np.asarray(h))[-1, -1])) for h in (hessian, fitted.state.hessian))
-    np.testing.assert_allclose(std, fits, rtol=0.05)
+    std, fits = (np.sqrt(np.diagonal(np.linalg.inv(np.asarray(h)))) for h in (hessian, fitted.state.hessian))
+    np.testing.assert_allclose(std[-1], fits[-1], rtol=0.05)
+    np.testing.assert_allclose(std, fits, rtol=0.15)  # friction bends near rest
 
 
 @pytest.mark.slow  # fast: test_information_along_the_logs_is_the_curvature_of_their_fit
@@ -158,7 +114,7 @@ def test_what_is_promised_is_what_a_fit_then_states_and_the_truth_is_near(slide)
     std = lambda expected: 0.1 * np.sqrt(after(np.asarray(designed.fit.cov), expected)[-1, -1])  # noqa: E731
     assert 1 / 1.5 < std(designed.expected) / stated < 1.5
     assert abs(value - 1.0) < 4 * stated
-    assert max(std(designed.expected), std(designed.old)) < std(designed.nothing)
+    assert max(std(designed.expected), std(designed.old)) < std(0 * designed.old)
 
 
 @pytest.fixture(scope="module")
@@ -168,18 +124,15 @@ def plan(slide):
 
 
 def test_no_motion_of_a_design_leaves_what_the_logs_visited(slide, plan):
-    _, data, fitted = slide
+    fitted = slide[-1]
     paths = drawn_paths(fitted, 300, key=jax.random.key(77))
     extremes = motions(paths, plan.limits, plan.t, plan.u, plan.start, 1, key=jax.random.key(78))
     assert np.all(np.asarray(extremes.lowest) >= plan.limits.lowest[None, None])
     assert np.all(np.asarray(extremes.highest) <= plan.limits.highest[None, None])
-    assert isinstance(plan.question, Several) and isinstance(plan.question.criteria[0], Friction)
-    whole, near = plan.question.criteria[0].weight
+    whole, near = plan.criterion.weight
     np.testing.assert_allclose([whole.sum(), near.sum()], 1.0)
     speed = np.abs(np.asarray(plan.fit.nodes))  # the slowest rows once more by themselves
     assert speed[near > 0].max() <= plan.slow[0] < speed[whole > 0].max()
-    again = design(fitted, data, key=jax.random.key(2), **THREE)
-    np.testing.assert_array_equal(plan.u, again.u)  # the same seed, the same numbers
 
 
 def test_what_can_be_played_is_written_with_a_page(slide, plan, tmp_path):
@@ -226,7 +179,7 @@ def test_declared_limits_hold_and_wrong_ones_are_told(slide):
     expected = limits_of(declared, system, data, path, used)
     assert (expected.low[0], expected.high[0], expected.rate[0]) == (-1.0, 2.0, 3.0)
     assert (expected.lowest[0], expected.highest[0], expected.first[0], expected.last[0]) == (-0.5, 0.5, -0.2, 0.3)
-    with pytest.raises(DesignError, match=r"begin at x = 0.7, out of the limits .*\[limits.start\]"):
+    with pytest.raises(DesignError, match=r"begin at x = 0.7 to 0.7, out of the limits .*\[limits.start\]"):
         limits_of(bounded(start={"x": (0.7, 0.7)}), system, data, path, used)
     with pytest.raises(DesignError, match=r"has no input.*\[input\]"):
         limits_of(dataclasses.replace(rig, input_columns=(), input_joints=()), system, data, path, used)
@@ -235,16 +188,6 @@ def test_declared_limits_hold_and_wrong_ones_are_told(slide):
     tight = fitted._replace(rig=bounded(values={"x": (-1e-4, 1e-4)}))
     with pytest.raises(DesignError, match=r"stay inside the limits; widen \[limits\]"):
         design(tight, data, key=jax.random.key(0), **THREE)
-
-
-def test_a_question_that_the_fit_cannot_answer_is_told(slide):
-    _, data, fitted = slide
-    for question, reason in (
-        ("spring", "possible here: friction, parameters, m, all"),
-        ("friction ", "not a question"),
-    ):
-        with pytest.raises(DesignError, match=reason):
-            design(fitted, data, key=jax.random.key(0), question=question)
     with pytest.raises(DesignError, match="give more --seconds"):
         design(fitted, data, key=jax.random.key(0), seconds=0.1)
 
@@ -252,35 +195,10 @@ def test_a_question_that_the_fit_cannot_answer_is_told(slide):
 # --- the command
 
 
-def _simulated(folder: Path) -> Path:
-    assert nnap("simulate", folder, "--system", "slide", "--sequences", 8, "--test", 0, "--steps", 95) == 0
-    return folder
-
-
-@pytest.mark.slow  # fast: test_what_can_be_played_is_written_with_a_page
-def test_old_and_new_logs_are_fitted_together_and_designed_for(tmp_path, monkeypatch):
-    """The new logs are the old ones with other names and other noise: all are there, each once, from another folder."""
-    old, new, out = _simulated(tmp_path / "old"), tmp_path / "new", tmp_path / "fit"
-    new.mkdir()
-    data = read_logs(old / "train", read_rig(old / "rig.toml", specs)).data
-    for i, (u, y) in enumerate(zip(data.u, data.y, strict=True)):
-        rows = [f"{t:.2f},{a[0]!r},{b[0] + 1e-4!r}" for t, a, b in zip(data.t[i], u.tolist(), y.tolist(), strict=True)]
-        (new / f"{i}.csv").write_text("\n".join(["time,u,x", *rows]) + "\n")
-    monkeypatch.chdir(old)
-    assert nnap("identify", ".", "--more", os.path.relpath(new, old), "--out", out, "--epochs", 2, "--quiet") == 0
-    monkeypatch.chdir(tmp_path)
-    assert "to 16 sequences" in json.loads((out / "report.json").read_text())["verdict"]
-    assert read(out / "model.npz").notes["logs"] == [str(old), str(new)]
-    with optimised():
-        assert nnap("design", out, "--out", tmp_path / "next", "--seconds", 6, "--sequences", 4, "--quiet") == 0
-    document = json.loads((tmp_path / "next" / "design.json").read_text())
-    assert document["seconds_each"] == 1.5 and len(document["inputs"]) == 4
-    assert not (tmp_path / "next" / "unfinished").exists()
-
-
 def test_logs_that_are_not_those_of_the_fit_are_refused(slide_fit, tmp_path, capsys):
     save(tmp_path / "fit" / "model.npz", slide_fit, fingerprint="other")
-    other = _simulated(tmp_path / "other")
+    other = tmp_path / "other"
+    assert nnap("simulate", other, "--system", "slide", "--sequences", 8, "--test", 0, "--steps", 95) == 0
     assert nnap("design", tmp_path / "fit", "--logs", other, "--out", tmp_path / "next") == 2
     assert "not the logs, or not read as those, of the fit" in capsys.readouterr().err
     assert nnap("design", tmp_path / "fit", "--logs", tmp_path / "gone", "--out", tmp_path / "next") == 2
@@ -306,10 +224,7 @@ WRONG = (
     ("[limits]\nU = 1", r"\[limits\] U: unknown table or key; did you mean 'u'"),
     ("[limits]\nu = 0", r"\[limits\] u: found 0; write .*above 0"),
     ("[limits]\nx = [2, 1]", r"\[limits\] x: found \[2, 1\]; write the lower bound first"),
-    ('[limits]\nu = "1"', r"\[limits\] u: found '1'; write u = 0.3 or"),
-    ("[limits]\nrate = 3", r"\[limits\] rate: found 3; write a table \[limits.rate\]"),
     ("[limits.rate]\nx = 3", r"\[limits.rate\] x: unknown"),
-    ("[limits.start]\nu = 3", r"\[limits.start\] u: unknown"),
 )
 
 
@@ -321,10 +236,3 @@ def test_wrong_limits_are_refused(tmp_path):
         path.write_text(f"{text}\n{lines}\n")
         with pytest.raises(RigError, match=reason):
             read_rig(path, specs)
-
-
-def test_the_figure_shows_all_of_every_input(plan):
-    """Rows share their axis: a sequence that hardly moves, at the end, hides nothing of the first."""
-    u = np.broadcast_to(np.asarray([3.0, 1.0, 0.01])[:, None, None], plan.u.shape)
-    low, high = motion_figure(plan._replace(u=u), names_of(plan.fitted), range(3)).axes[0].get_ylim()
-    assert low < 0.01 and high > 3.0

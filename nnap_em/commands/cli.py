@@ -144,7 +144,7 @@ def parser() -> argparse.ArgumentParser:
     _file(export, "--out", "OUT", "folder for the files")
     _file(export, "--mjcf", "FILE", "write a machine that came from a file back as MJCF")
     _file(export, "--urdf", "FILE", "write a machine that came from a URDF file back as URDF")
-    _file(export, "--c", "FILE", "friction and feed-forward torque, or equations, as C99")
+    _file(export, "--c", "FILE", "friction and feed-forward torque as C99")
     _file(export, "--observer", "FILE", "write an online estimator of the states as C99")
     export.add_argument("--float", action="store_true", help="numbers of 32 bits in that estimator")
     return top

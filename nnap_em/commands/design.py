@@ -16,7 +16,7 @@ import time
 
 import jax
 
-from ..experiment.experiment import check_question, design
+from ..experiment.experiment import design, open_of
 from ..fit.identify import Identified
 from ..fit.store import Stored, model_file, read
 from ..report.design import check_places, write_design
@@ -31,7 +31,7 @@ def run(args: argparse.Namespace, log: Log) -> None:
     require_joints(stored.fitted.rig, "design")
     fitted, bench = _logs(args, stored)
     question = vars(args)["for"]
-    check_question(question, fitted)
+    open_of(question, fitted)
     check_places(args.out, args.sequences)
     with resumable(args, bench, log):
         designed = design(

@@ -25,7 +25,7 @@ from .common import require_joints
 def run(args: argparse.Namespace, log: Log) -> None:
     """Write its numbers, and it for a simulator, a controller, or as an observer."""
     fitted = load(model_file(args.model))
-    for option in ("mjcf", "urdf", "observer"):
+    for option in ("mjcf", "urdf", "c", "observer"):
         if getattr(args, option) is not None:
             require_joints(fitted.rig, f"--{option}")
     for path, write, problem in (

@@ -1,21 +1,22 @@
 """Two or more fits of one machine side by side: every number with its difference, its test and one pooled value."""
 
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from ..data.machine import unpacked
+from ..data.rig import Rig
 from ..diagnosis.findings import Estimate, estimates
 from ..diagnosis.hypothesis import covariances
 from ..diagnosis.keys import key_of, listed, words
 from ..diagnosis.statistics import holm
 from ..fit.identify import Identified, friction_table, nodes_between, parameter_table
-from ..fit.store import model_file, read
+from ..fit.store import load, model_file
 from ..model.friction import FrictionNetwork
 from ..model.law import CALLED, LAW_UNITS, fit_law
 from ..numerics.digits import counted
@@ -32,15 +33,6 @@ class CompareError(ValueError):
     """Fits that cannot be compared: the message names them and the reason, with a hint."""
 
 
-class Fit(NamedTuple):
-    """One of the fits."""
-
-    name: str
-    fitted: Identified
-    fingerprint: str = ""
-    """Fingerprint of its logs; empty where it is not known."""
-
-
 class Quantity(NamedTuple):
     """An estimated number in every fit, or the numbers of a friction curve, which are tested as one."""
 
@@ -54,7 +46,7 @@ class Quantity(NamedTuple):
     """Difference between the fits [standard deviations]."""
     pooled: Pooled
     test: JointTest | None
-    """None where fewer than two fits estimate it."""
+    """None where fewer than two fits estimate it; its p-value is corrected for the number of quantities."""
 
     @property
     def changed(self) -> bool:
@@ -65,14 +57,10 @@ class Quantity(NamedTuple):
 class Comparison(NamedTuple):
     """Fits of one machine side by side."""
 
-    fits: tuple[Fit, ...]
+    rig: Rig
+    names: tuple[str, ...]
+    """Names of the fits."""
     quantities: tuple[Quantity, ...]
-    warnings: tuple[str, ...]
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the fits."""
-        return tuple(fit.name for fit in self.fits)
 
     @property
     def changed(self) -> tuple[str, ...]:
@@ -88,7 +76,7 @@ class Comparison(NamedTuple):
         return f"{several} beyond the stated errors (at {CHANGED:.0%}){which}."
 
     def __str__(self) -> str:
-        return "\n  ".join(["Comparison", self.verdict, *self.warnings])
+        return f"Comparison\n  {self.verdict}"
 
 
 def compare(*fits: Path | str | Identified, names: Sequence[str] = ()) -> Comparison:
@@ -106,131 +94,97 @@ def compare(*fits: Path | str | Identified, names: Sequence[str] = ()) -> Compar
         Parameters and friction curves with their values, differences and p-values; `print` shows the outcome.
 
     Raises:
-        CompareError: the fits are fewer than two, the same, or of different machines.
+        CompareError: the fits are fewer than two, or of different machines.
         StoreError: a file is no fit.
 
     Example:
-        >>> [fit.name for fit in nnap_em.compare(fit, other, names=("January", "June")).fits]
-        ['January', 'June']
+        >>> nnap_em.compare(fit, other, names=("January", "June")).names
+        ('January', 'June')
     """
-    opened = [_opened(fit) for fit in fits]
-    labels = tuple(names) or _labels(fits, opened)
+    opened = [fit if isinstance(fit, Identified) else load(model_file(Path(fit))) for fit in fits]
+    labels = tuple(names) or _labels(fits)
     if len(opened) < 2:
         raise CompareError(f"{len(opened) or 'no'} fit is given; give two or more, of one machine")
-    if len(set(labels)) != len(opened):
+    if len({*labels}) != len(opened):
         raise CompareError(f"names {', '.join(labels)} for {len(opened)} fits; give each fit a name of its own")
-    together = tuple(fit._replace(name=label) for fit, label in zip(opened, labels, strict=True))
-    pairs = list(itertools.combinations(together, 2))
-    for one, two in pairs:
-        _check(one, two)
-    quantities = corrected([*_curves(together), *_numbers(together)])
-    warnings = tuple(
-        f"{one.name} and {two.name} are of the same logs: their errors are not independent"
-        for one, two in pairs
-        if one.fingerprint and one.fingerprint == two.fingerprint
-    )
-    return Comparison(together, quantities, warnings)
+    for name, fit in zip(labels[1:], opened[1:], strict=True):
+        _check({labels[0]: opened[0], name: fit})
+    return Comparison(opened[0].rig, labels, corrected([*_curves(opened), *_numbers(opened)]))
 
 
 def corrected(quantities: Sequence[Quantity]) -> tuple[Quantity, ...]:
     """The quantities with p-values that are corrected for their number."""
-    p = iter(holm([q.test.p_alone for q in quantities if q.test is not None]))
+    p = iter(holm([q.test.p_value for q in quantities if q.test is not None]))
     return tuple(q if q.test is None else q._replace(test=q.test._replace(p_value=float(next(p)))) for q in quantities)
 
 
 # --- the fits
 
 
-def _opened(fit: Path | str | Identified) -> Fit:
-    """A fit with all that is known of its logs."""
-    if isinstance(fit, Identified):
-        return Fit("", fit)
-    stored = read(model_file(Path(fit)))
-    return Fit("", stored.fitted, stored.fingerprint)
-
-
-def _labels(sources: Sequence[Path | str | Identified], opened: Sequence[Fit]) -> tuple[str, ...]:
-    """Short names that differ: of the folder, else the paths as they are given, else numbers."""
+def _labels(fits: Sequence[Path | str | Identified]) -> tuple[str, ...]:
+    """Short names of the fits: their folders, or the paths as they are given where two folders have one name."""
     short, full = [], []
-    for source, fit in zip(sources, opened, strict=True):
-        path = None if isinstance(source, Identified) else model_file(Path(source)).absolute()
-        folder = path and (path.parent.name if path.stem in ("model", "after") else path.stem)
-        short.append(folder or fit.fitted.rig.name)
-        full.append(str(source) if folder else short[-1])
-    numbered = [f"fit {i}" for i in range(1, len(short) + 1)]
-    return tuple(next(labels for labels in (short, full, numbered) if len(set(labels)) == len(labels)))
+    for i, fit in enumerate(fits, 1):
+        path = None if isinstance(fit, Identified) else model_file(Path(fit)).absolute()
+        short.append(f"fit {i}" if path is None else path.parent.name if path.stem in ("model", "after") else path.stem)
+        full.append(f"fit {i}" if path is None else str(fit))
+    return tuple(short if len({*short}) == len(short) else full)
 
 
-def _check(one: Fit, two: Fit) -> None:
-    """Refuse fits of different machines, and a fit beside itself."""
-    hint = "compare fits of one machine"
-    a, b = one.fitted, two.fitted
-    if a.rig.system != b.rig.system:
-        raise CompareError(f"{one.name} is of system {a.rig.system} and {two.name} of {b.rig.system}; {hint}")
-    joints = [listed(fit.model.system.coordinates) for fit in (a, b)]
-    if joints[0] != joints[1]:
-        raise CompareError(f"{one.name} has the joints {joints[0]} and {two.name} has {joints[1]}; {hint}")
-    if lacking := sorted({*a.rig.parameters} ^ {*b.rig.parameters}):
-        has, lacks = (one, two) if lacking[0] in a.rig.parameters else (two, one)
-        raise CompareError(f"{has.name} declares {lacking[0]} and {lacks.name} does not; {hint}")
-    for name, declared in a.rig.parameters.items():
-        other = b.rig.parameters[name]
-        if declared.std == other.std == 0 and declared.mean != other.mean:
-            values = f"{declared.mean:.6g} in {one.name} and {other.mean:.6g} in {two.name}"
-            raise CompareError(f"the trusted {name} is {values}; {hint}, or declare it as uncertain in both")
-    if a.rig.equations != b.rig.equations:
-        raise CompareError(f"the equations of {one.name} and {two.name} differ; {hint}")
-    if a.rig.machine and _body(a) != _body(b):
-        raise CompareError(f"the machine files of {one.name} and {two.name} differ; {hint}")
-    if all(np.array_equal(x, y) for x, y in zip(_identity(a), _identity(b), strict=True)):
-        raise CompareError(f"{one.name} and {two.name} are the same fit; give each fit once")
+def _check(pair: Mapping[str, Identified]) -> None:
+    """Refuse fits of different machines."""
+    names, sides = " and ".join(pair), [_machine(fit) for fit in pair.values()]
+    for what, one in sides[0].items():
+        if (other := sides[1].get(what, one)) != one:
+            values = f": {one} and {other}" if len(f"{one}{other}") < 80 else ""
+            raise CompareError(f"{what} of {names} differs{values}; compare fits of one machine")
 
 
-def _body(fitted: Identified):
-    """The machine of a file without its path and its sensors."""
-    return unpacked(fitted.rig.machine)._replace(file="", joint_sensors=(), sites=(), sensors=())
-
-
-def _identity(fitted: Identified) -> tuple:
-    """Numbers by which a fit is identified."""
-    model, weights = fitted.model, fitted.m_step.weights(fitted.model)
-    return weights.read(model), model.log_q, model.log_r, fitted.state.hessian, fitted.state.loglik
+def _machine(fitted: Identified) -> dict[str, Any]:
+    """All that fits of one machine have in common; its file counts without its path and its sensors."""
+    rig, parameters = fitted.rig, fitted.rig.parameters
+    return {
+        "the system": rig.system,
+        "the list of joints": listed(fitted.model.system.coordinates),
+        "the list of parameters": listed(sorted(parameters)),
+        "the text of the equations": rig.equations,
+        "the machine file": rig.machine
+        and unpacked(rig.machine)._replace(file="", joint_sensors=(), sites=(), sensors=()),
+    } | {f"the trusted {name}": f"{number.mean:.6g}" for name, number in parameters.items() if number.std == 0}
 
 
 # --- the quantities
 
 
-def _curves(fits: Sequence[Fit]) -> Iterator[Quantity]:
+def _curves(fits: Sequence[Identified]) -> Iterator[Quantity]:
     """The friction of every joint: a test of the curves on the velocities that all fits know, and Stribeck numbers."""
-    networks = {i: fit.fitted.model.unknown for i, fit in enumerate(fits)}
-    places = [i for i, network in networks.items() if isinstance(network, FrictionNetwork)]
-    if not places:
+    networks = {i: fit.model.unknown for i, fit in enumerate(fits) if isinstance(fit.model.unknown, FrictionNetwork)}
+    if not networks:
         return
-    reach = np.min([np.asarray(networks[i].speed) for i in places], axis=0)  # type: ignore[attr-defined]
-    compared_velocities = 41  # velocities of a friction curve: as many as the M-step has
-    nodes = nodes_between(-reach, reach, compared_velocities)
-    tables = [friction_table(fits[i].fitted, jnp.asarray(nodes)) for i in places]
-    for j, angle in enumerate(fits[0].fitted.model.system.angles[: len(nodes)]):
+    places, reach = [*networks], np.min([np.asarray(network.speed) for network in networks.values()], axis=0)
+    nodes = nodes_between(-reach, reach, 41)  # as many as the M-step has
+    tables = [friction_table(fits[i], jnp.asarray(nodes)) for i in places]
+    for j, angle in enumerate(fits[0].model.system.angles[: len(nodes)]):
         torque, cov = np.stack([table.torque[j] for table in tables]), np.stack([table.cov[j] for table in tables])
         law = fit_law(np.stack([nodes[j]] * len(places)), torque, cov)
         value, std = np.full((2, len(fits), len(CALLED)), np.nan)
         value[places], std[places] = law.value, law.std
         test = joint_test(torque, cov) if len(places) > 1 else None
-        rows = tuple(zip(CALLED, LAW_UNITS[angle], strict=True))
-        yield quantity(f"friction of joint {j + 1}", rows, value, std, test)
+        yield quantity(
+            f"friction of joint {j + 1}", tuple(zip(CALLED, LAW_UNITS[angle], strict=True)), value, std, test
+        )
 
 
-def _numbers(fits: Sequence[Fit]) -> Iterator[Quantity]:
+def _numbers(fits: Sequence[Identified]) -> Iterator[Quantity]:
     """The estimated parameters of the machine and of effects."""
-    tables = [_estimates(fit.fitted) for fit in fits]
-    periodic = "phase of"  # beginning of parameters of effects that are the same after a whole turn [rad]
+    tables = [_estimates(fit) for fit in fits]
     for name in dict.fromkeys(itertools.chain(*tables)):
         entries = [table.get(name) for table in tables]
         value, std = (np.asarray([np.nan if entry is None else entry[i] for entry in entries], float) for i in range(2))
-        if name.startswith(periodic):
+        if name.startswith("phase of"):  # the same after a whole turn
             first = value[np.isfinite(value)][0]
             value = first + np.remainder(value - first + np.pi, 2 * np.pi) - np.pi
-        priors = (fit.fitted.rig.parameters[name].std for fit in fits if name in fit.fitted.rig.parameters)
+        priors = (fit.rig.parameters[name].std for fit in fits if name in fit.rig.parameters)
         prior = min((prior for prior in priors if prior > 0), default=np.inf)
         yield number(name, next(entry.unit for entry in entries if entry is not None), value, std, prior)
 
@@ -263,11 +217,8 @@ def quantity(
     test: JointTest | None,
     prior_std: float = np.inf,
 ) -> Quantity:
-    """Numbers with their differences, pooled over the fits that estimate them, the errors widened as the test has it.
-
-    A prior of standard deviation `prior_std` is in all of them.
-    """
+    """Numbers with their differences, pooled over the fits that estimate them; their prior has std `prior_std`."""
     has = (np.isfinite(value) & np.isfinite(std) & (std > 0)).all(axis=1)
     values, stds = value[has], std[has]
-    pooled = pool(values, stds, max(prior_std, stds.max(initial=0.0)), 1.0 if test is None else test.widened)
+    pooled = pool(values, stds, max(prior_std, stds.max(initial=0.0)), test)
     return Quantity(name, rows, value, std, apart(values, stds), pooled, test)

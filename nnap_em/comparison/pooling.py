@@ -1,6 +1,5 @@
 """One quantity from several fits: a joint test that it is the same in all of them, and one pooled answer."""
 
-import math
 from typing import NamedTuple
 
 import numpy as np
@@ -21,18 +20,8 @@ class JointTest(NamedTuple):
     statistic: float
     """Wald statistic, which is chi-square with `freedom` degrees of freedom where nothing changed."""
     freedom: int
-    p_alone: float
-    """Chance of such a statistic where nothing changed."""
     p_value: float
-    """The same, corrected for the number of quantities."""
-
-    @property
-    def widened(self) -> float:
-        """Multiple of the stated errors that the differences show, 1 at least: (Q / freedom)^1/2.
-
-        [Birge 1932, Phys. Rev. 40, 207]
-        """
-        return max(1.0, math.sqrt(self.statistic / max(self.freedom, 1)))
+    """Chance of such a statistic where nothing changed."""
 
 
 class Pooled(NamedTuple):
@@ -57,13 +46,11 @@ def joint_test(value: Float[np.ndarray, "fit number"], cov: Float[np.ndarray, "f
     spread = np.einsum("ai,bi,imn->ambn", contrasts, contrasts, cov).reshape(differences.size, differences.size)
     scale = np.sqrt(np.maximum(np.diag(spread), 0.0))
     known = scale > 0
-    unit = spread[np.ix_(known, known)] / np.outer(scale[known], scale[known])
-    variance, turn = np.linalg.eigh(unit)
+    variance, turn = np.linalg.eigh(spread[np.ix_(known, known)] / np.outer(scale[known], scale[known]))
     determined = variance >= LEAST_VARIANCE
     along = turn.T @ (differences[known] / scale[known])
     statistic, freedom = float(np.sum(along[determined] ** 2 / variance[determined])), int(determined.sum())
-    p = float(scipy.stats.chi2.sf(statistic, freedom)) if freedom else 1.0
-    return JointTest(statistic, freedom, p, p)
+    return JointTest(statistic, freedom, float(scipy.stats.chi2.sf(statistic, freedom)) if freedom else 1.0)
 
 
 def apart(value: Float[np.ndarray, "fit number"], std: Float[np.ndarray, "fit number"]) -> Float[np.ndarray, " number"]:
@@ -79,14 +66,16 @@ def pool(
     value: Float[np.ndarray, "fit number"],
     std: Float[np.ndarray, "fit number"],
     prior_std: float = np.inf,
-    widened: float = 1.0,
+    test: JointTest | None = None,
 ) -> Pooled:
-    """Mean of each number by itself, weighted by 1 / s^2, with `widened` times its standard deviation.
+    """Mean of each number by itself, weighted by 1 / s^2.
 
     A prior of standard deviation `prior_std`, which every fit has in its posterior, is taken out of each and counts
-    once in the result.
+    once in the result. Where the fits differ by more than they state, the standard deviation is widened by
+    (Q / freedom)^1/2 of their `test` [Birge 1932, Phys. Rev. 40, 207].
     """
     shared = 1 / prior_std**2
     weight = np.maximum(1 / std**2 - shared, 1e-9 / std**2)
     total = weight.sum(axis=0)
+    widened = 1.0 if test is None else np.sqrt(max(1.0, test.statistic / max(test.freedom, 1)))
     return Pooled(np.sum(weight * value, axis=0) / total, widened / np.sqrt(total + shared))

@@ -1,9 +1,5 @@
-"""Design criteria: costs of expected information, in units of a logarithm, so that costs can be added.
+"""Design criterion: a cost of expected information, in units of a logarithm: one less is a factor e in a std."""
 
-The smaller the `cost`, the better it is answered; one less is a factor e in a standard deviation.
-"""
-
-import math
 from typing import NamedTuple
 
 import jax
@@ -43,45 +39,28 @@ def share(fit: Fit, logs: Float[np.ndarray, "phi phi"]) -> float:
     return 1.0 if wider(1.0) >= 0 or wider(1e-6) <= 0 else root_scalar(wider, bracket=(1e-6, 1.0)).root
 
 
-class Friction(NamedTuple):
-    """Width of the friction bands, the widest first: over all velocities, and once more near rest."""
+class Criterion(NamedTuple):
+    """Width of the friction bands, the widest first, over all velocities and once more near rest; and mean logarithm
+    of the standard deviations of parameters, in those of the prior."""
 
     fit: Fit
     scale: Float[np.ndarray, " dof"]
-    """Size of the map of each joint [N m]."""
+    """Size of the friction map of each joint [N m]."""
     weight: Float[np.ndarray, "range dof node"]
     """Weight of velocities, in every range; their sum is 1."""
+    friction: bool = True
+    """True where friction counts."""
+    places: tuple[int, ...] = ()
+    """Parameters that count, among all."""
 
     def cost(self, expected: Information) -> Float[np.ndarray, "*proposal"]:
-        shape = self.weight.shape[1:]
+        """Cost of information, of friction and parameters together."""
         variance = np.diagonal(after(np.asarray(self.fit.cov), expected), axis1=-2, axis2=-1)
-        variance = variance[..., : math.prod(shape)].reshape(*variance.shape[:-1], *shape)
-        relative = variance / self.scale[:, None] ** 2
-        mean = np.einsum("...jn,rjn->...r", relative**2, self.weight)
-        return np.asarray(0.25 * np.mean(np.log(mean + 1e-30), axis=-1))
-
-
-class Parameters(NamedTuple):
-    """Mean logarithm of the standard deviations of some parameters, in those of the prior."""
-
-    fit: Fit
-    places: tuple[int, ...]
-    """Among all parameters."""
-
-    def cost(self, expected: Information) -> Float[np.ndarray, "*proposal"]:
-        where = np.asarray(self.places) + self.fit.nodes.size
-        cov = after(np.asarray(self.fit.cov), expected)
-        variance = np.maximum(np.diagonal(cov, axis1=-2, axis2=-1)[..., where], 1e-30)
-        return np.asarray(0.5 * np.mean(np.log(variance), axis=-1))
-
-
-class Several(NamedTuple):
-    """More than one criterion, each as important."""
-
-    criteria: tuple[Friction | Parameters, ...]
-
-    def cost(self, expected: Information) -> Float[np.ndarray, "*proposal"]:
-        return np.asarray(np.sum([q.cost(expected) for q in self.criteria], axis=0))
-
-
-Criterion = Friction | Parameters | Several
+        shape, size, cost = self.fit.nodes.shape, self.fit.nodes.size, np.zeros(variance.shape[:-1])
+        if self.friction:
+            relative = variance[..., :size].reshape(*cost.shape, *shape) / self.scale[:, None] ** 2
+            mean = np.einsum("...jn,rjn->...r", relative**2, self.weight)
+            cost += 0.25 * np.mean(np.log(mean + 1e-30), axis=-1)
+        if self.places:
+            cost += 0.5 * np.mean(np.log(np.maximum(variance[..., np.add(self.places, size)], 1e-30)), axis=-1)
+        return cost

@@ -13,15 +13,15 @@ from ..fit.identify import Identified
 from ..fit.predict import drawn_paths, posterior_of
 from ..numerics.digits import counted
 from ..storage.log import Log, silent
-from .criteria import Criterion, Friction, Information, Parameters, Several, share, some
+from .criteria import Criterion, Information, share, some
 from .information import Fit, information, known
 from .limits import DesignError, Limits, limits_of
 from .play import allowed, motions
 from .search import DESIGN_EFFORT, Effort, Plan, Setup, evaluated, search
 from .signals import Proposal, played, starts
 
-CHECKED, DRAWN_IN = 500, 200
-"""Models by which the chosen ones are tried, and how many of these are drawn in a figure."""
+TRIED, CHECKED, DRAWN_IN = 32, 500, 200
+"""Models from the posterior by which every proposal is tried, and the chosen ones; how many of these a figure shows."""
 
 
 class Design(NamedTuple):
@@ -44,16 +44,9 @@ class Design(NamedTuple):
     """Information of all sequences."""
     old: Information
     """Information of as much time of the old inputs."""
-    question: Criterion
+    criterion: Criterion
     slow: Float[np.ndarray, " dof"]
     """Speed below which a fifth of the rows of the logs are: near rest [rad/s]."""
-    friction_weight: Float[np.ndarray, "dof node"]
-    """Weight of velocities; 0 where the logs never were."""
-
-    @property
-    def nothing(self) -> Information:
-        """Information without an experiment."""
-        return np.zeros_like(self.expected)
 
 
 def design(
@@ -89,7 +82,7 @@ def design(
         DesignError: the rig has no input, a start is out of the limits, or nothing is open.
     """
     key_paths, key_noise, key_check, key_search = jax.random.split(key, 4)
-    check_question(question, fitted)
+    friction, places = open_of(question, fitted)
     rows = round(seconds / sequences / fitted.rig.dt)
     if rows < 20:
         raise DesignError(
@@ -103,11 +96,9 @@ def design(
     visited = path[followed][:, dof : 2 * dof]
     slow = np.percentile(np.abs(visited), 20, axis=0)  # speeds near rest: of 20 % of the rows,
     slow = np.maximum(slow, np.sort(np.abs(fit.nodes), axis=1)[:, 2])  # or up to the first nodes where it stood still
-    friction = _friction(fit, visited, slow)
-    criterion = _criterion(question, fitted, fit, friction)
+    criterion = Criterion(fit, *_weighted(fit, visited, slow), friction, places)
     t = fitted.rig.dt * np.arange(rows + 1)
-    trial_models = 32  # models from the posterior by which every proposal is tried
-    setup = Setup(fit, drawn_paths(fitted, trial_models, key=key_paths), limits, t, key_noise)
+    setup = Setup(fit, drawn_paths(fitted, TRIED, key=key_paths), limits, t, key_noise)
     row = _row_of_logs(setup, data, path, used)
     count = float(np.sum(np.asarray(data.valid)[used]))
     setup = setup._replace(share=share(fit, count * row))
@@ -117,53 +108,28 @@ def design(
     plan, trials = _checked(setup, checked, plan, effort, log)
     u, start = played(plan.proposal, limits, t), starts(plan.proposal, limits)
     low, middle, high = np.quantile(np.asarray(trials.x)[..., : start.shape[1]], (0.01, 0.5, 0.99), axis=1)
-    return Design(
-        fitted,
-        limits,
-        t,
-        u,
-        start,
-        low,
-        middle,
-        high,
-        fit,
-        plan.expected.sum(axis=0),
-        setup.share * sequences * t.size * row,
-        criterion,
-        slow,
-        friction.weight[0],
-    )
+    old = setup.share * sequences * t.size * row
+    expected = plan.expected.sum(axis=0)
+    return Design(fitted, limits, t, u, start, low, middle, high, fit, expected, old, criterion, slow)
 
 
-def check_question(name: str, fitted: Identified) -> None:
-    """Raise DesignError where a fit has no criterion of that name."""
-    prior = fitted.m_step.prior
-    several = {"friction": fitted.rig.friction, "parameters": prior.size}
-    known = [kind for kind, there in several.items() if there]
-    if known:
-        known += [*prior.declared, "all"]
-    if name not in known:
-        why = {
-            "parameters": "the fit estimates none; declare one as { mean, std } in rig.toml and identify again",
-            "friction": "the rig is declared free of friction",
-        }.get(name, "not a question of this fit")
-        names = ", ".join(known) or "none: the fit has no friction map and no parameter"
-        raise DesignError(f"--for {name}: {why}; possible here: {names}")
+def open_of(question: str, fitted: Identified) -> tuple[bool, tuple[int, ...]]:
+    """True where a question is about friction, and places of the parameters that it is about.
+
+    Raises DesignError where the fit leaves nothing of that name open.
+    """
+    prior, friction = fitted.m_step.prior, fitted.rig.friction
+    every, known = tuple(range(prior.size)), {"friction": (True, ())} if friction else {}
+    known |= {"parameters": (False, every)} if every else {}
+    known |= {name: (False, (i,)) for i, name in enumerate(prior.declared)} | {"all": (friction, every)}
+    if question not in known or not (friction or every):
+        names = ", ".join(known) if friction or every else "none: the fit has no friction map and no parameter"
+        raise DesignError(f"--for {question}: not a question of this fit; possible here: {names}")
+    return known[question]
 
 
-def _criterion(name: str, fitted: Identified, fit: Fit, friction: Friction) -> Criterion:
-    """The criterion of that name, or all of those that there are."""
-    prior, criteria = fitted.m_step.prior, {}
-    if fitted.rig.friction:
-        criteria["friction"] = friction
-    if prior.size:
-        criteria["parameters"] = Parameters(fit, tuple(range(prior.size)))
-    singles = {name: Parameters(fit, (i,)) for i, name in enumerate(prior.declared)}  # they stand first
-    return Several(tuple(criteria.values())) if name == "all" else (criteria | singles)[name]
-
-
-def _friction(fit: Fit, visited: Float[np.ndarray, "row dof"], slow: Float[np.ndarray, " dof"]) -> Friction:
-    """Over the visited velocities, near rest no more than its share; and near rest alone."""
+def _weighted(fit: Fit, visited: Float[np.ndarray, "row dof"], slow: Float[np.ndarray, " dof"]):
+    """Size of the friction of every joint, and weight of velocities: the visited ones, and near rest alone."""
     nodes, dof = np.asarray(fit.nodes), fit.nodes.shape[0]
     low, high = np.percentile(visited, [0.5, 99.5], axis=0)
     # Share of the largest velocity: below it velocities count alike, above it the less the denser they would be
@@ -174,11 +140,11 @@ def _friction(fit: Fit, visited: Float[np.ndarray, "row dof"], slow: Float[np.nd
     weight = weight / np.maximum(weight.sum(axis=2, keepdims=True), 1e-12) / dof
     torque = np.stack([np.asarray(fit.model.unknown(jnp.asarray(v))) for v in nodes.T], axis=1)
     scale = np.sqrt(np.sum(weight[0] * torque**2, axis=1) * dof)
-    return Friction(fit, np.maximum(scale, 1e-3 * scale.max() + 1e-12), weight)
+    return np.maximum(scale, 1e-3 * scale.max() + 1e-12), weight
 
 
 def _checked(setup: Setup, checked: Setup, plan: Plan, effort: Effort, log: Log):
-    """The plan by many more models; a sequence that breaks a limit is made smaller until it does not."""
+    """The plan and its motions by many more models; sequences that break a limit are made smaller."""
     proposal = Proposal(*map(np.array, plan.proposal))
     for _ in range(12):
         u, start = played(proposal, setup.limits, setup.t), starts(proposal, setup.limits)
@@ -191,9 +157,8 @@ def _checked(setup: Setup, checked: Setup, plan: Plan, effort: Effort, log: Log)
     else:
         raise DesignError("no sequence of this kind stays inside the limits; widen [limits] in rig.toml")
     count = len(proposal.family)
-    padded = some(proposal, np.arange(effort.batch) % count)  # as many as are played at once: one program serves
-    _, each = evaluated(setup, padded, effort.few)
-    return Plan(proposal, some(each, np.arange(count))), trials
+    _, each = evaluated(setup, some(proposal, np.arange(effort.batch) % count), effort.few)  # one program serves
+    return Plan(proposal, each[:count]), trials
 
 
 def _row_of_logs(setup: Setup, data: Dataset, path: Float[np.ndarray, "seq time state"], used) -> Information:

@@ -51,7 +51,9 @@ def _information(fit: Fit, one) -> Float[Array, "phi phi"]:
 
     def along(x):
         linear, filtered, path = linearised(fit, seq, x)
-        jac = _sensitivities(fit, linear, filtered, path)
+        readings = reading_columns(fit.nodes, _speeds(path, fit.nodes.shape[0]), linear)
+        jac = whitened_sensitivities(filtered, columns_of(fit, linear, path), readings, linear.seq.observed)
+        jac = jac.reshape(-1, jac.shape[-1])  # of the whitened readings to phi
         return jac.T @ jac
 
     return jnp.mean(jax.vmap(along)(motions), axis=0)
@@ -76,9 +78,10 @@ def _speeds(path: Gaussian, dof: int) -> Float[Array, "time point dof"]:
     """All that the path may have."""
     v = path.mean[:, None, dof : 2 * dof]
     std = jnp.sqrt(jnp.maximum(jnp.diagonal(path.cov, axis1=1, axis2=2), 0.0))[:, None, dof : 2 * dof]
-    # Three points of the same mean and variance as a normal distribution [standard deviations]
-    points = (-math.sqrt(1.5), 0.0, math.sqrt(1.5))
-    return v + std * jnp.asarray(points, v.dtype)[None, :, None]
+    points = jnp.asarray(
+        (-math.sqrt(1.5), 0.0, math.sqrt(1.5)), v.dtype
+    )  # of a normal distribution's mean and variance
+    return v + std * points[None, :, None]
 
 
 def columns_of(fit: Fit, linear: Local, path: Gaussian) -> Float[Array, "time state phi"]:
@@ -86,11 +89,3 @@ def columns_of(fit: Fit, linear: Local, path: Gaussian) -> Float[Array, "time st
     speeds = _speeds(path, fit.nodes.shape[0])
     torque = jax.vmap(lambda v, b: friction_columns(fit.nodes, v, b))(speeds, linear.by_force)
     return jnp.where(linear.seq.active[:, None, None], jnp.concatenate([torque, linear.by_parameter], axis=-1), 0.0)
-
-
-def _sensitivities(fit: Fit, linear: Local, filtered: Filtered, path: Gaussian) -> Float[Array, "row phi"]:
-    """Sensitivities of the whitened readings to phi."""
-    columns = columns_of(fit, linear, path)
-    readings = reading_columns(fit.nodes, _speeds(path, fit.nodes.shape[0]), linear)
-    jac = whitened_sensitivities(filtered, columns, readings, linear.seq.observed)
-    return jac.reshape(-1, jac.shape[-1])

@@ -67,19 +67,17 @@ def limits_of(
     first, last = _bounds(names, bounds.start, rest, rest)
     for name, a, b, lo, hi in zip(names, first, last, low, high, strict=True):
         if a < lo or b > hi:
-            where = f"{a:.4g}" if a == b else f"{a:.4g} to {b:.4g}"
             raise DesignError(
-                f"a sequence would begin at {name} = {where}, out of the limits {lo:.4g} to {hi:.4g}; write another "
-                f"{name} in [limits.start] of rig.toml, or wider limits in [limits]"
+                f"a sequence would begin at {name} = {a:.4g} to {b:.4g}, out of the limits {lo:.4g} to {hi:.4g}; write "
+                f"another {name} in [limits.start] of rig.toml, or wider limits in [limits]"
             )
-    if (idle := inputs[0] >= inputs[1]).any():
-        name = rig.input_columns[int(idle.argmax())]
-        raise DesignError(f"the input {name} never moved, and no limit is declared; write {name} = 0.3 in [limits]")
+    for name, a, b in zip(rig.input_columns, *inputs, strict=True):
+        if a >= b:
+            raise DesignError(f"the input {name} never moved, and no limit is declared; write {name} = 0.3 in [limits]")
     return Limits(*inputs, rate, low, high, first, last)
 
 
 def _bounds(names: Sequence[str], declared: Mapping[str, Range], low, high) -> tuple[np.ndarray, np.ndarray]:
     """Declared bounds, and others where there are none."""
     pairs = [declared.get(name, (lo, hi)) for name, lo, hi in zip(names, low, high, strict=True)]
-    first, last = np.array(pairs, float).T
-    return first, last
+    return tuple(np.array(pairs, float).T)  # type: ignore[return-value]

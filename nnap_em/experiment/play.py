@@ -23,14 +23,6 @@ class Motions(NamedTuple):
     """The first motions themselves."""
 
 
-class _Common(NamedTuple):
-    paths: Paths
-    spread: Float[Array, " readable"]
-    """Standard deviation of the first state."""
-    recorded: Float[Array, " recorded"]
-    """An entry for each motion that is recorded."""
-
-
 def motions(
     paths: Paths,
     limits: Limits,
@@ -46,30 +38,26 @@ def motions(
     reach = (limits.highest - limits.lowest)[: angle.size]
     # Standard deviation of a start that is set by hand, over the range that the coordinate may have, or over a turn
     spread = 0.01 * np.where(angle, np.minimum(reach, 2 * np.pi), reach)
-    common = _Common(paths, jnp.asarray(np.concatenate([spread, np.zeros_like(spread)])), jnp.zeros(recorded))
+    common = paths, jnp.asarray(np.concatenate([spread, np.zeros_like(spread)])), jnp.zeros(recorded)
     keys = jax.random.split(key, 1)[np.zeros(len(u), int)]
     return each(_motions, common, (blank(t, u, len(paths.model.measured)), jnp.asarray(start), keys))
 
 
 def blank(t: Float[np.ndarray, " time"], u: Float[np.ndarray, "proposal time input"], obs: int) -> Dataset:
     """Sequences that nobody has read yet."""
-    count, time = u.shape[:2]
-    return Dataset(
-        jnp.broadcast_to(jnp.asarray(t), (count, time)),
-        jnp.asarray(u),
-        jnp.zeros((count, time, obs)),
-        jnp.ones((count, time), bool),
-    )
+    shape = u.shape[:2]
+    times = jnp.broadcast_to(jnp.asarray(t), shape)
+    return Dataset(times, jnp.asarray(u), jnp.zeros((*shape, obs)), jnp.ones(shape, bool))
 
 
-def _motions(common: _Common, one) -> Motions:
+def _motions(common: tuple[Paths, Float[Array, " readable"], Float[Array, " recorded"]], one) -> Motions:
+    """Motions of a proposal; `common` has the spread of the first state, and an entry for each motion to be kept."""
     (paths, spread, recorded), (seq, start, key) = common, one
     model, count = paths.model, paths.tables.shape[0]
     key_start, key_kick = jax.random.split(key)
     free = spread.shape[0]
     first = jnp.concatenate([start, model.start.mean[free:]])  # effects begin at rest
-    x0 = jnp.broadcast_to(first, (count, first.shape[0]))
-    x0 = x0.at[:, :free].add(spread[None] * jax.random.normal(key_start, (count, free)))
+    x0 = jnp.tile(first, (count, 1)).at[:, :free].add(spread[None] * jax.random.normal(key_start, (count, free)))
     kick = jax.random.normal(key_kick, (seq.t.shape[0], *x0.shape)) * jnp.exp(0.5 * model.log_q)[None, None]
 
     def step(carry, slices):

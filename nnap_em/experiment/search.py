@@ -4,7 +4,8 @@ Friction has kinks, limits are walls and a free arm is chaotic, so that a slope 
 search is a seeded one.  Motions and information of a batch of proposals are a step, which is found again after a stop.
 """
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import NamedTuple, TypeVar
 
 import jax
 import numpy as np
@@ -36,6 +37,7 @@ class Effort(NamedTuple):
 
 
 DESIGN_EFFORT = Effort()
+_Tree = TypeVar("_Tree")
 
 
 class Setup(NamedTuple):
@@ -94,9 +96,7 @@ def search(
         reach = change[0] * (change[1] / change[0]) ** (number / max(effort.rounds - 1, 1))
         plan = _bettered(setup, criterion, plan, rng, reach, effort)
         cost = float(criterion.cost(plan.expected.sum(axis=0)))
-        log(
-            f"round {number + 1} of {effort.rounds}: cost {cost:.3f} (one less is a factor 2.7 in a standard deviation)"
-        )
+        log(f"round {number + 1} of {effort.rounds}: cost {cost:.3f} (one less: a factor 2.7 in a standard deviation)")
     return plan
 
 
@@ -115,7 +115,7 @@ def _pool(setup: Setup, count: int, rng: np.random.Generator, effort: Effort, lo
         waiting.shape[~ok, :, -1] *= shrinks
         fresh = drawn(rng, effort.batch, inputs, states)
         again = ~ok & (waiting.shape[..., -1].max(axis=1) > shrinks**6)
-        waiting = Proposal(*(_where(again, a, b) for a, b in zip(waiting, fresh, strict=True)))
+        waiting = _joined([some(waiting, again), some(fresh, ~again)])
     plan = _joined(plans)
     if len(plan.proposal.family) < count:
         raise DesignError(
@@ -145,9 +145,5 @@ def _bettered(
     return plan
 
 
-def _joined(plans: list[Plan]) -> Plan:
+def _joined(plans: Sequence[_Tree]) -> _Tree:
     return jax.tree.map(lambda *parts: np.concatenate(parts), *plans)
-
-
-def _where(keep: Bool[np.ndarray, " proposal"], a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return np.where(keep.reshape(-1, *[1] * (a.ndim - 1)), a, b)

@@ -1,8 +1,8 @@
-"""Friction and feed-forward torque, or equations, of a fitted model as C99, with the mathematics library alone."""
+"""Friction and feed-forward torque of a fitted model as C99, with the mathematics library alone."""
 
 import math
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,9 +13,7 @@ from ..effects import AbstractEffect
 from ..effects.base import OperatingPoint
 from ..fit.identify import Identified
 from ..model import hooks
-from ..model.state_space import Inputs
 from ..storage.files import replace_own
-from .model import described, inputs_of, states_of
 from .placement import of_command
 from .unroll import Line, Source, unrolled
 
@@ -45,13 +43,12 @@ def torques(fitted: Identified) -> tuple[Callable, Callable, tuple[AbstractEffec
 
 
 def write_c(fitted: Identified, out: Path | str) -> list[str]:
-    """Write friction and feed-forward torque per joint to a C99 file, or rates and readings of equations.
+    """Write friction and feed-forward torque per joint to a C99 file.
 
-    Functions are named after the file: `arm_friction(v, tau)` and `arm_feedforward(q, v, a, time, tau)` for `arm.c`;
-    of equations `tanks_rates(x, u, rate)` and `tanks_readings(x, u, y)` for `tanks.c`.
+    Functions are named after the file: `arm_friction(v, tau)` and `arm_feedforward(q, v, a, time, tau)` for `arm.c`.
 
     Args:
-        fitted: the model.
+        fitted: the model, of a machine with joints.
         out: the file.
 
     Returns:
@@ -60,23 +57,25 @@ def write_c(fitted: Identified, out: Path | str) -> list[str]:
     Raises:
         ExportError: a law has no plain C form; nothing is written.
     """
-    out = Path(out)
-    name = identifier(out.stem)
-    functions, sizes, left, lines = (_equations if fitted.rig.equations else _joints)(fitted, name)
+    out, system = Path(out), fitted.model.system
+    name, still = identifier(out.stem), jnp.zeros(len(system.coordinates))
+    friction, feedforward, left = torques(fitted)
+    sources = [
+        unrolled(f"{name}_friction", friction, v=still),
+        unrolled(f"{name}_feedforward", feedforward, q=still, v=still, a=still, time=jnp.zeros(1)),
+    ]
     absent = [f"{effect.name}{f' at joint {effect.joint}' if effect.joint else ''}" for effect in left]
-    first, last = (
-        f"{fitted.rig.name}: written by nnap_em {__version__}.",
+    units = [f"{q} [{system.unit(q)}], torque [{system.force_unit(j)}]" for j, q in enumerate(system.coordinates, 1)]
+    lines = [
+        f"{fitted.rig.name}: written by nnap_em {__version__}.  Link with -lm.",
+        f"SI units.  Joints: {', '.join(units)}.",
+        f"{name}_friction: friction torque at joint rates v.",
+        f"{name}_feedforward: torque of the drives that gives acceleration a at q, v; time is that of the fit's clock.",
         f"Not in here: {', '.join(absent) or 'nothing'}.",
-    )
-    text = "\n   ".join([f"{first}  Link with -lm.", *lines, last]).replace("*/", "* /")
-    sizes = ", ".join(f"{name.upper()}_{what} = {size}" for what, size in sizes.items())
-    head = f"""/* {text} */
-#include <math.h>
-
-{WHOLE}
-enum {{ {sizes} }};
-"""
-    replace_own({out: head + "\n" + "\n".join(functions)})
+    ]
+    text, size = "\n   ".join(lines).replace("*/", "* /"), f"enum {{ {name.upper()}_JOINTS = {still.size} }};"
+    head = f"/* {text} */\n#include <math.h>\n\n{WHOLE}\n{size}\n\n"
+    replace_own({out: head + "\n".join(map(function, sources))})
     return absent
 
 
@@ -84,43 +83,6 @@ def identifier(stem: str) -> str:
     """The name of a file as one in C."""
     name = re.sub(r"\W", "_", stem)
     return f"model_{name}" if name[:1].isdigit() else name
-
-
-def _joints(fitted: Identified, name: str) -> tuple[list[str], dict[str, int], Sequence[AbstractEffect], list[str]]:
-    """Functions of friction and feed-forward torque, their sizes, laws that are not in them, and lines about them."""
-    system, (friction, feedforward, without) = fitted.model.system, torques(fitted)
-    still = jnp.zeros(len(system.coordinates))
-    sources = [
-        unrolled(f"{name}_friction", friction, v=still),
-        unrolled(f"{name}_feedforward", feedforward, q=still, v=still, a=still, time=jnp.zeros(1)),
-    ]
-    units = ", ".join(
-        f"{q} [{system.unit(q)}], torque [{system.force_unit(j)}]" for j, q in enumerate(system.coordinates, 1)
-    )
-    lines = [
-        f"SI units.  Joints: {units}.",
-        f"{name}_friction: friction torque at joint rates v.",
-        f"{name}_feedforward: torque of the drives that gives acceleration a at q, v; time is that of the fit's clock.",
-    ]
-    return list(map(function, sources)), {"JOINTS": len(still)}, without, lines
-
-
-def _equations(fitted: Identified, name: str) -> tuple[list[str], dict[str, int], Sequence[AbstractEffect], list[str]]:
-    """The same of rates and readings of equations, at states, those of laws behind them, and inputs that reach them."""
-    model, x, u = fitted.model, fitted.model.start.mean, jnp.zeros(len(fitted.rig.input_columns))
-    push = jnp.zeros(len(model.system.ports))
-    rates = unrolled(f"{name}_rates", lambda x, u: (model.rate(x, Inputs.held(u), push),), x=x, u=u)
-    readings = unrolled(f"{name}_readings", lambda x, u: (model.emission(x, Inputs.held(u)),), x=x, u=u)
-    units = {column: model.system.unit(column) for column in fitted.rig.measured}
-    lines = [
-        f"States x: {described({n: model.system.unit(n) for n in states_of(model)})}.",
-        f"Inputs u: {described(inputs_of(fitted)) or 'none'}.  Readings y: {described(units)}.",
-        f"{name}_rates: derivatives of the states by time [per second].",
-        f"{name}_readings: what the sensors read, without noise.",
-    ]
-    code = [function(rates, out="rate"), function(readings, out="y")]
-    sizes = {"STATES": len(x), "INPUTS": len(u), "READINGS": len(units)}
-    return code, sizes, [effect for effect in model.effects if of_command(effect)], lines
 
 
 class Dialect(NamedTuple):
@@ -149,7 +111,7 @@ class Dialect(NamedTuple):
 PLAIN = Dialect()
 
 
-def function(source: Source, dialect: Dialect = PLAIN, out: str = "tau", points: str = "") -> str:
+def function(source: Source, dialect: Dialect = PLAIN, points: str = "") -> str:
     """A C function of arrays, whose last argument `out` is the result.
 
     With `points` of them the first argument and the result have an axis more; curves are read before the loop over it.
@@ -161,7 +123,7 @@ def function(source: Source, dialect: Dialect = PLAIN, out: str = "tau", points:
         f"{name}{i}": f"{name}[{i}]{at if axes[name] else ''}" for name, n in source.sizes.items() for i in range(n)
     }
     arrays = ", ".join(f"const {real} {name}[{size or 1}]{axes[name]}" for name, size in source.sizes.items())
-    lines = [f"{dialect.words} {source.name}({arrays}, {real} {out}[{own}{len(source.results) or 1}]{along})", "{"]
+    lines = [f"{dialect.words} {source.name}({arrays}, {real} out[{own}{len(source.results) or 1}]{along})", "{"]
     lines += [f"    (void){name};" for name in source.sizes]
     used = {value for line in source.lines for value in line.values} | {*source.results}
     inside = [f"const {real} {name} = {place};" for name, place in places.items() if name in used]
@@ -173,7 +135,7 @@ def function(source: Source, dialect: Dialect = PLAIN, out: str = "tau", points:
             lines += [f"    {real} {line.name}s{along};", f"{loop} {line.name}s{at} = {curve};"]
             text = f"{line.name}s{at}"
         inside.append(f"const {'int' if line.whole else real} {line.name} = {text};")
-    inside += [f"{out}[{i}]{at} = {dialect.scalar(value)};" for i, value in enumerate(source.results)]
+    inside += [f"out[{i}]{at} = {dialect.scalar(value)};" for i, value in enumerate(source.results)]
     if points:
         inside = [f"{loop.strip()} {{", *(f"    {line}" for line in inside), "}"]
     return "\n".join([*lines, *(f"    {line}" for line in inside), "}", ""])

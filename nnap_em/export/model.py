@@ -1,16 +1,14 @@
 """A fitted model for other programs: its numbers as JSON."""
 
 import math
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
 from .. import __version__
 from ..effects import AbstractEffect
 from ..fit.identify import Identified, friction_table, parameter_table
-from ..model.friction import FrictionNetwork
 from ..model.state_space import StateSpaceModel
 from ..report.tables import json_text
 from ..storage.files import replace_own
@@ -71,7 +69,7 @@ def parameters(fitted: Identified) -> dict[str, Any]:
             "mean": _pairs(states, np.asarray(model.start.mean)),
             "std": _pairs(states, np.sqrt(np.diag(np.asarray(model.start.cov)))),
         },
-        "friction": _friction(fitted) if rig.friction else None,
+        "friction": {"joints": _friction(fitted)} if rig.friction else None,
         "effects": [_effect(effect, system) for effect in model.effects],
     }
 
@@ -80,11 +78,6 @@ def inputs_of(fitted: Identified) -> dict[str, str]:
     """Inputs and their units."""
     rig, pairs = fitted.rig, zip(fitted.rig.input_columns, fitted.rig.input_joints, strict=True)
     return {name: rig.unit(name) if rig.equations else fitted.model.system.force_unit(joint) for name, joint in pairs}
-
-
-def described(units: Mapping[str, str]) -> str:
-    """Names with their units, as far as they have one."""
-    return ", ".join(f"{name} [{unit}]" if unit else name for name, unit in units.items())
 
 
 def states_of(model: StateSpaceModel) -> tuple[str, ...]:
@@ -97,27 +90,15 @@ def _pairs(names: tuple[str, ...], values: np.ndarray) -> dict[str, float]:
     return dict(zip(names, values.tolist(), strict=True))
 
 
-def _friction(fitted: Identified) -> dict[str, Any]:
-    """The learned map as a table and as the weights of its network."""
-    nodes = fitted.m_step.weights(fitted.model).nodes
-    table = friction_table(fitted, nodes)
-    unknown = cast(FrictionNetwork, fitted.model.unknown)
+def _friction(fitted: Identified) -> list[dict[str, Any]]:
+    """The learned map of each joint as a table."""
+    table = friction_table(fitted, fitted.m_step.weights(fitted.model).nodes)
     columns = {"velocity": table.velocity, "torque": table.torque, "torque_std": table.std}
-    return {
-        "joints": [
-            {"joint": j + 1, "velocity_unit": rate, "torque_unit": force}
-            | {name: np.asarray(values[j]).tolist() for name, values in columns.items()}
-            for j, (rate, force) in enumerate(table.units)
-        ],
-        "network": {
-            "form": "scale * mlp(v / speed, asinh(v / knee) / asinh(speed / knee)), tanh layers, one network per joint",
-            **{name: np.asarray(getattr(unknown, name)).tolist() for name in ("speed", "knee", "scale")},
-            "layers": [
-                {"weight": np.asarray(layer.weight).tolist(), "bias": np.asarray(layer.bias).tolist()}
-                for layer in unknown.mlp.layers
-            ],
-        },
-    }
+    return [
+        {"joint": j + 1, "velocity_unit": rate, "torque_unit": force}
+        | {name: np.asarray(values[j]).tolist() for name, values in columns.items()}
+        for j, (rate, force) in enumerate(table.units)
+    ]
 
 
 def _effect(effect: AbstractEffect, system: AbstractPlant) -> dict[str, Any]:

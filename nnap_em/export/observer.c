@@ -26,7 +26,7 @@ static void triangle(real w[N][3 * N + 1], int columns, real s[N][N])
 }
 
 /* States one row later, by Runge-Kutta steps; points are the last axis, so that a compiler with vectors may use them. */
-static void transition(const real *in, const real *p, real x[N][2 * N])
+static void transition(const real *in, real x[N][2 * N])
 {
     static const real ahead[4] = {(real)0.5, (real)0.5, 1, 0}, share[4] = {1, 2, 2, 1};
     const real h = (real)(DT / SUBSTEPS);
@@ -47,7 +47,7 @@ static void transition(const real *in, const real *p, real x[N][2 * N])
             const real s = (n + when[stage]) / SUBSTEPS;
             for (int i = 0; i < D; i++) now[i] = in[i] + s * (in[COURSE + i] - (1 - s) / 2 * in[COURSE + D + i]);
 #endif
-            rate((const real (*)[2 * N])at, now, p, slope);
+            rate((const real (*)[2 * N])at, now, slope);
             for (int i = 0; i < N; i++)
                 for (int j = 0; j < 2 * N; j++) {
                     at[i][j] = start[i][j] + forward * slope[i][j];
@@ -58,7 +58,7 @@ static void transition(const real *in, const real *p, real x[N][2 * N])
 }
 
 /* One branch a row later, by cubature: the points are opposite pairs along the columns of the root. */
-static void predict(const real *in, const real *p, nnap_branch *b)
+static void predict(const real *in, nnap_branch *b)
 {
     real x[N][2 * N], w[N][3 * N + 1], reach = SQRT((real)N);
     for (int i = 0; i < N; i++)
@@ -66,7 +66,7 @@ static void predict(const real *in, const real *p, nnap_branch *b)
             x[i][j] = b->mean[i] + reach * b->root[i][j];
             x[i][N + j] = b->mean[i] - reach * b->root[i][j];
         }
-    transition(in, p, x);
+    transition(in, x);
     for (int i = 0; i < N; i++) {
         real sum = 0;
         for (int j = 0; j < N; j++) sum += x[i][j] + x[i][N + j];
@@ -74,7 +74,7 @@ static void predict(const real *in, const real *p, nnap_branch *b)
         for (int j = 0; j < N; j++) {
             w[i][j] = (x[i][j] - x[i][N + j]) / (2 * reach);
             w[i][N + j] = ((x[i][j] + x[i][N + j]) / 2 - b->mean[i]) / reach;
-            w[i][2 * N + j] = i == j ? p[PROCESS + i] : 0;
+            w[i][2 * N + j] = i == j ? kick[i] : 0;
         }
     }
     triangle(w, 3 * N, b->root);
@@ -103,13 +103,13 @@ static real update(const real h[N], real r, int keep, real root[N][N], real alon
 }
 
 /* A branch after the readings that `use` has, the others aside; `innovation` gets those of them. */
-static void absorb(const real *in, const real *p, const real y[M], const int use[M], real gate, nnap_branch *b)
+static void absorb(const real *in, const real y[M], const int use[M], real gate, nnap_branch *b)
 {
     real value[M + M * N], about[N], along[N];
-    reading(b->mean, in, p, value);
+    reading(b->mean, in, value);
     for (int i = 0; i < N; i++) about[i] = b->mean[i];
     for (int i = 0; i < M; i++) {
-        real *h = value + M + i * N, e, r = p[NOISE + i] * p[NOISE + i], s, white;
+        real *h = value + M + i * N, e, r = noise[i] * noise[i], s, white;
         if (!use[i]) continue;
         e = y[i] - value[i];
         for (int k = 0; k < N; k++) e -= h[k] * (b->mean[k] - about[k]);
@@ -298,7 +298,7 @@ int nnap_step(nnap_state *s, const real *u, const real *y)
     for (int i = 0; i < D; i++) in[i] = in[D + i] = s->fed[i];
     if (takes) {
         const real begins = SMOOTH ? first : s->age < 0.5 * DT;
-        commands(s->memory, s->u, &begins, s->parameter, out);
+        commands(s->memory, s->u, &begins, out);
         for (int i = 0; i < MEMORY; i++) s->memory[i] = out[i];
         for (int i = 0; i < D; i++) s->fed[i] = out[MEMORY + i];
     }
@@ -317,8 +317,8 @@ int nnap_step(nnap_state *s, const real *u, const real *y)
     for (int k = 0; k < s->live; k++) {
         nnap_branch *b = &s->branch[k];
         for (int i = 0; i < M; i++) b->innovation[i] = 0;
-        if (waiting) absorb(in, s->parameter, s->late, before, gate, b);
-        if (!first) predict(in, s->parameter, b);
+        if (waiting) absorb(in, s->late, before, gate, b);
+        if (!first) predict(in, b);
     }
     s->time += DT;
     s->age += DT;
@@ -330,7 +330,7 @@ int nnap_step(nnap_state *s, const real *u, const real *y)
     in[2 * D + 1] = (real)s->age;
     for (int k = 0; k < s->live; k++) {
         nnap_branch *b = &s->branch[k];
-        absorb(in, s->parameter, value, now, gate, b);
+        absorb(in, value, now, gate, b);
         if (!isfinite(b->log_weight)) b->log_weight = -INFINITY;
     }
     best = likeliest(s);
@@ -347,7 +347,7 @@ int nnap_step(nnap_state *s, const real *u, const real *y)
     if (!(s->misfit < DIVERGED) || !sound(&s->branch[best])) {
         flags |= nnap_RESTARTED;
         alone(s, again_mean, again_root);
-        absorb(in, s->parameter, value, now, INFINITY, &s->branch[0]);
+        absorb(in, value, now, INFINITY, &s->branch[0]);
         s->branch[0].log_weight = 0;
         for (int i = 0; i < M; i++) s->innovation[i] = 0;
         if (!sound(&s->branch[0])) alone(s, again_mean, again_root);
@@ -367,7 +367,6 @@ int nnap_step(nnap_state *s, const real *u, const real *y)
 void nnap_start(nnap_state *s, double time)
 {
     alone(s, start_mean, start_root);
-    for (int i = 0; i < PARAMETERS; i++) s->parameter[i] = fitted[i];
     for (int i = 0; i < MEMORY; i++) s->memory[i] = 0;
     for (int i = 0; i < COLUMNS; i++) s->u[i] = 0;
     for (int i = 0; i < D; i++) s->fed[i] = s->past[i] = 0;

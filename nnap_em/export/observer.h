@@ -2,7 +2,6 @@
    SI units, a row every $dt s.  States: $states.
    Inputs u, $held: $columns.
    Readings y; NaN is none: $measured.
-   Parameters: $parameters.
 
    nnap_start(&s, time), then in every row flags = nnap_step(&s, u, y); a row without readings is one of NaN.
    s.mean and s.std are the estimate, s.innovation the readings minus their prediction over the standard deviation,
@@ -22,8 +21,7 @@ typedef struct {
 } nnap_branch;
 typedef struct {
     nnap_real mean[NNAP_STATES], std[NNAP_STATES], innovation[NNAP_READINGS], late[NNAP_READINGS];
-    nnap_real parameter[NNAP_PARAMETERS + !NNAP_PARAMETERS], u[NNAP_INPUTS + !NNAP_INPUTS];
-    nnap_real misfit, weight, memory[$memory], fed[$drives], past[$drives];
+    nnap_real u[NNAP_INPUTS + !NNAP_INPUTS], misfit, weight, memory[$memory], fed[$drives], past[$drives];
     double time, age;
     int rows, live;
     nnap_branch branch[NNAP_BRANCHES + 2];

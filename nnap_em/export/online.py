@@ -14,7 +14,6 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Float
 
 from .. import __version__
-from ..em.prior import ParameterPrior
 from ..fit import observer as observing
 from ..fit.identify import Identified
 from ..model import hooks
@@ -23,7 +22,7 @@ from ..model.state_space import Inputs, StateSpaceModel
 from ..smoother.mixture import WIDE_STD
 from ..storage.files import replace_own
 from .c99 import WHOLE, Dialect, function, identifier
-from .model import ExportError, states_of
+from .model import ExportError
 from .unroll import named, unrolled
 
 DEGREE = 7
@@ -101,41 +100,12 @@ def write_observer(fitted: Identified, out: Path | str, *, single: bool = False)
     replace_own({out.with_suffix(".h"): header, out: source})
 
 
-class Numbers(NamedTuple):
-    """Numbers of an observer that a program may change: estimated ones, then both noises."""
-
-    names: tuple[str, ...]
-    values: tuple[float, ...]
-
-
-def numbers(fitted: Identified) -> Numbers:
-    """Estimated numbers of the machine, standard deviations of the readings, and those of the kicks of a row."""
-    model, own = fitted.model, _estimated(fitted)
-    values = [*(float(own.read(model)[i]) for i in range(own.size))]
-    values += [float(x) for x in np.exp(0.5 * np.concatenate([model.log_r, model.log_q]))]
-    names = (
-        *own.names,
-        *(f"noise.{name}" for name in fitted.rig.measured),
-        *(f"kick.{name}" for name in states_of(model)),
-    )
-    return Numbers(names, tuple(values))
-
-
-def _estimated(fitted: Identified) -> ParameterPrior:
-    """Estimated numbers of the machine itself, in their own units."""
-    servos = {servo.column for servo in fitted.model.servos or ()}
-    names = tuple(n for n in fitted.m_step.prior.declared if n.rpartition(".")[0] not in servos)
-    names = tuple(n for n in names if np.ndim(fitted.model.parameter(n)) == 0)
-    return ParameterPrior(names, jnp.zeros(len(names)), jnp.ones(len(names)))
-
-
 def observer_c(fitted: Identified, stem: str, *, single: bool = False) -> tuple[str, str]:
     """Source and header of the observer of a fit."""
     name = identifier(stem)
     dialect = Dialect("real", "static void", single)
     with jax.enable_x64(not single):
-        model, prior = jax.tree.map(_cast, (fitted.model, _estimated(fitted)))
-        functions, memory = _functions(model, prior, dialect)
+        functions, memory = _functions(jax.tree.map(_cast, fitted.model), dialect)
     return _source(fitted, stem, dialect, functions, memory), _header(fitted, name, dialect, memory)
 
 
@@ -143,7 +113,7 @@ def _cast(a: Any) -> Any:
     return a.astype(jnp.result_type(float)) if isinstance(a, jax.Array) and a.dtype.kind == "f" else a
 
 
-def _functions(model: StateSpaceModel, prior: ParameterPrior, dialect: Dialect) -> tuple[list[str], int]:
+def _functions(model: StateSpaceModel, dialect: Dialect) -> tuple[list[str], int]:
     """Friction tables, rate, reading and commands in C, and the size of the memory of the commands."""
     # Largest error of a friction table over the size of the torque, in 64 and 32 bits; else the network is kept
     exact = {False: 1e-11, True: 1e-6}
@@ -171,13 +141,11 @@ def _functions(model: StateSpaceModel, prior: ParameterPrior, dialect: Dialect) 
         change = jnp.zeros((2, drives), u.dtype) if model.smooth else None
         return Inputs(u, before, time, age, row[2 * drives + 2 :] if scales else None, change)
 
-    def rate(x, row, p, friction=unknown):
-        written = dataclasses.replace(prior.write(model, p[: prior.size]), unknown=friction)
-        return (written.rate(x, inputs(row), jnp.zeros(dof, x.dtype)),)
+    def rate(x, row, friction=unknown):
+        return (dataclasses.replace(model, unknown=friction).rate(x, inputs(row), jnp.zeros(dof, x.dtype)),)
 
-    def reading(x, row, p):
-        read = prior.write(model, p[: prior.size]).emission
-        return read(x, inputs(row)), jax.jacfwd(read)(x, inputs(row))
+    def reading(x, row):
+        return model.emission(x, inputs(row)), jax.jacfwd(model.emission)(x, inputs(row))
 
     try:
         stream = hooks.command_stream(model.effects, model.servos, system, model.rows)
@@ -185,18 +153,16 @@ def _functions(model: StateSpaceModel, prior: ParameterPrior, dialect: Dialect) 
         raise ExportError(str(error)) from None
     flat, unravel = ravel_pytree(stream.memory)
 
-    def commands(memory, u, first, p):
+    def commands(memory, u, first):
         after, fed = stream.step(unravel(memory), u, first[0] > 0.5)
         return ravel_pytree(after)[0], fed
 
-    size = prior.size + len(model.measured) + model.log_q.shape[0]
-    row, p = jnp.zeros(2 * drives + 2 + scales), jnp.concatenate([prior.read(model), jnp.ones(size - prior.size)])
-    x = jnp.asarray(model.start.mean)
-    true = lambda x, row, p: rate(x, row, p, network)  # noqa: E731
+    x, row = jnp.asarray(model.start.mean), jnp.zeros(2 * drives + 2 + scales)
+    true = lambda x, row: rate(x, row, network)  # noqa: E731
     sources = [
-        unrolled("rate", rate, true, x=x, row=row, p=p),
-        unrolled("reading", reading, x=x, row=row, p=p),
-        unrolled("commands", commands, memory=flat, u=jnp.zeros(drives + scales), first=jnp.ones(1), p=p),
+        unrolled("rate", rate, true, x=x, row=row),
+        unrolled("reading", reading, x=x, row=row),
+        unrolled("commands", commands, memory=flat, u=jnp.zeros(drives + scales), first=jnp.ones(1)),
     ]
     texts.append(function(sources[0], dialect, points="2 * N"))
     return [*texts, *(function(source, dialect) for source in sources[1:])], flat.size
@@ -206,11 +172,10 @@ def _source(fitted: Identified, stem: str, dialect: Dialect, functions: list[str
     """The C file: numbers, the functions of the model, the filter."""
     name = identifier(stem)
     model, drives, angles = fitted.model, len(fitted.model.system.joints), fitted.bank.angles
-    own, again, dof = numbers(fitted), observing.restart_prior(model), len(model.system.coordinates)
+    again, dof = observing.restart_prior(model), len(model.system.coordinates)
     n, m, scales = model.log_q.shape[0], len(fitted.rig.measured), len(fitted.rig.scale_columns)
     sizes = {
         "N": n, "M": m, "D": drives, "SCALES": scales, "COLUMNS": drives + scales, "MEMORY": memory,
-        "PARAMETERS": len(own.names), "NOISE": len(own.names) - n - m, "PROCESS": len(own.names) - n,
         "COURSE": 2 * drives + 2 + scales, "ROW": 4 * drives + 2 + scales + 1,
         "SUBSTEPS": model.steps, "SETTLING": observing.SETTLING, "ANGLES": len(angles), "DEGREE": DEGREE,
         "DIGITS": 23 if dialect.single else 52, "BIAS": 127 if dialect.single else 1023,
@@ -222,7 +187,8 @@ def _source(fitted: Identified, stem: str, dialect: Dialect, functions: list[str
     root = lambda cov: np.linalg.cholesky(np.asarray(cov, float))  # noqa: E731
     arrays = {
         "start_mean[N]": model.start.mean, "start_root[N][N]": root(model.start.cov), "again_mean[N]": again.mean,
-        "again_root[N][N]": root(again.cov), "fitted[PARAMETERS]": own.values,
+        "again_root[N][N]": root(again.cov), "noise[M]": np.exp(0.5 * np.asarray(model.log_r)),
+        "kick[N]": np.exp(0.5 * np.asarray(model.log_q)),
     }  # fmt: skip
     waits = [int(place >= 2 * dof and not model.smooth) for place in model.measured]
     calls = ("sqrt", "fabs", "exp", "log", "fmax")
@@ -254,18 +220,18 @@ def _source(fitted: Identified, stem: str, dialect: Dialect, functions: list[str
 
 def _header(fitted: Identified, name: str, dialect: Dialect, memory: int) -> str:
     """Declarations of the C file, with the meaning of every number."""
-    rig, system, own = fitted.rig, fitted.model.system, numbers(fitted)
+    rig, system = fitted.rig, fitted.model.system
     names, columns = system.coordinates + system.rates, (*rig.input_columns, *rig.scale_columns)
     states, extra = [f"{x} [{system.unit(x)}]" for x in names], fitted.model.log_q.shape[0] - len(names)
     sizes = {
         "STATES": len(names) + extra, "READINGS": len(rig.measured), "INPUTS": len(columns),
-        "PARAMETERS": len(own.names), "BRANCHES": _branches(fitted),
+        "BRANCHES": _branches(fitted),
     }  # fmt: skip
     words = {
         "rig": rig.name, "version": __version__, "dt": f"{rig.dt:g}", "columns": ", ".join(columns) or "none",
         "held": "signals read in this row" if fitted.model.smooth else "held from the row before to this one",
         "states": ", ".join(states) + (f", {extra} of laws with memory" if extra else ""),
-        "measured": ", ".join(rig.measured), "parameters": ", ".join(own.names), "gate": f"{observing.GATE:g}",
+        "measured": ", ".join(rig.measured), "gate": f"{observing.GATE:g}",
         "sizes": ", ".join(f"{name.upper()}_{key} = {size}" for key, size in sizes.items()), "memory": max(memory, 1),
         "real": "float" if dialect.single else "double", "drives": max(len(system.joints), 1),
     }  # fmt: skip
@@ -278,7 +244,7 @@ def _template(file: str, name: str) -> str:
 
 
 def _branches(fitted: Identified) -> int:
-    return 16 if fitted.bank.angles else 1  # Gaussians at most, where an angle is not read
+    return observing.BRANCHES if fitted.bank.angles else 1
 
 
 def _comment(text: str) -> str:

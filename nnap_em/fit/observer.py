@@ -20,7 +20,7 @@ from ..model import hooks
 from ..model.friction import FrictionNetwork
 from ..model.state_space import Inputs, StateSpaceModel
 from ..numerics.gaussian import MOST_UNROLLED, Gaussian, symmetric
-from ..smoother.kalman import CUBATURE, Cubature, Tangent, absorbed, linear_reading, moved
+from ..smoother.kalman import CUBATURE, absorbed, linear_reading, moved
 from ..smoother.mixture import WIDE_STD, Components, merged, split
 from .identify import Identified
 
@@ -33,6 +33,8 @@ FORGET = 0.02
 DIVERGED = 9.0
 """Mean of squared innovations from which on the estimate starts anew: three standard deviations, where one is right;
 fourteen rows in a row beyond the gate."""
+BRANCHES = 16
+"""Gaussians at most, where an angle is not read."""
 BRANCH_END = 1e-7
 """Probability of a branch below which it ends."""
 TWIN = 0.1
@@ -117,15 +119,13 @@ class _Row(NamedTuple):
     age: Float[Array, ""]
 
 
-def observer(fitted: Identified, *, branches: int = 16, linearise: Tangent | Cubature = CUBATURE) -> Observer:
+def observer(fitted: Identified) -> Observer:
     """The model of a fit as an online estimator, a row every `rig.dt` seconds.
 
     A reading that depends on the input of its own row, an acceleration, counts one row later.
 
     Args:
         fitted: the model.
-        branches: Gaussians at most, where an angle is not read; one where all are.
-        linearise: tangent or cubature.
 
     Returns:
         Pure functions `start` and `step(state, u, y)`; NaN means no reading.
@@ -143,7 +143,7 @@ def observer(fitted: Identified, *, branches: int = 16, linearise: Tangent | Cub
     if rig.equations:
         raise ValueError(f"observer: rig {rig.name!r} is written as equations; this needs a machine with joints")
     return Observer(
-        *functions(model, fitted.bank.angles, restart_prior(model), branches if fitted.bank.angles else 1, linearise),
+        *functions(model, fitted.bank.angles, restart_prior(model), BRANCHES if fitted.bank.angles else 1),
         model.system.coordinates + model.system.rates,
         rig.input_columns + rig.scale_columns,
         rig.measured,
@@ -161,7 +161,7 @@ def restart_prior(model: StateSpaceModel) -> Gaussian:
 
 
 def functions(
-    model: StateSpaceModel, angles: tuple[int, ...], again: Gaussian, branches: int, linearise: Tangent | Cubature
+    model: StateSpaceModel, angles: tuple[int, ...], again: Gaussian, branches: int
 ) -> tuple[Callable[..., Observation], Callable[..., Observation]]:
     """`start` and `step` of a model whose `angles` may be in several places, with the prior of a new start."""
     if isinstance(model.unknown, FrictionNetwork) and model.log_q.shape[0] <= MOST_UNROLLED:
@@ -215,7 +215,7 @@ def functions(
         if waits.any():
             y, waited = jnp.nan_to_num(late), jnp.isfinite(late)
             x, *before, _ = absorbed(x, linear_reading(model, x.mean, row.held), r, y, waited, row.gate)
-        _, ahead = moved(x, linearise(model, x, row.held), q, ~row.first)
+        _, ahead = moved(x, CUBATURE(model, x, row.held), q, ~row.first)
         now = absorbed(ahead, linear_reading(model, ahead.mean, row.here), r, row.y, row.read, row.gate)
         return now[0], before[0] + now[1], before[1] + now[2]
 

@@ -112,7 +112,7 @@ def describe(design: Design) -> dict[str, Any]:
 def _stds(design: Design) -> dict[str, Float[np.ndarray, " phi"]]:
     """Standard deviations now, and after each of two experiments."""
     cov = np.asarray(design.fit.cov)
-    sides = {"now": design.nothing, "expected": design.expected, "same_time_of_old_inputs": design.old}
+    sides = {"now": 0 * design.old, "expected": design.expected, "same_time_of_old_inputs": design.old}
     return {side: np.sqrt(np.diagonal(after(cov, information))) for side, information in sides.items()}
 
 
@@ -121,7 +121,7 @@ def friction_entries(design: Design) -> list[dict[str, Any]]:
     nodes, out = np.asarray(design.fit.nodes), []
     stds = {side: std[: nodes.size].reshape(nodes.shape) for side, std in _stds(design).items()}
     for j, v in enumerate(nodes):
-        seen = design.friction_weight[j] > 0
+        seen = design.criterion.weight[0, j] > 0
         near = seen & (np.abs(v) <= design.slow[j])
         rms = {side: float(np.sqrt(np.mean(std[j][near] ** 2))) for side, std in stds.items()}
         curves = {"velocity": v[seen]} | {f"std_{side}": std[j][seen] for side, std in stds.items()}

@@ -111,22 +111,21 @@ def _error_pictures(
 ) -> list[Picture]:
     """Pictures of prediction errors, of the learned friction, and of the prediction of the longest test sequence."""
     alone = lambda sides: sides if "after" in sides else {"fit": sides["before"]}  # noqa: E731
-    out = []
+    errors, friction, motion = [], [], []
     if error and test and reached(error):
-        caption = "On test sequences that no fit and no choice has seen."
         both = {name: error[name] for name in predicted}
         figure = error_figure({name: error[name] for name in ("horizons_s", "reach_s")} | alone(both), names)
-        out.append(picture("error", "Prediction error", caption, figure))
+        caption = "On test sequences that no fit and no choice has seen."
+        errors.append(picture("error", "Prediction error", caption, figure))
+        longest, given = int(np.argmax(np.sum(np.asarray(test.data.valid), axis=1))), error["given_s"]
+        figure = prediction_figure(alone(predicted), test.data, names, given, longest)
+        caption = f"The longest one ({test.files[longest]}), predicted from its first {given:g} s."
+        motion.append(picture("error", "One test sequence", caption, figure))
     if tables:
         caption = "A missing effect bends the friction that is learned without it." if len(tables) > 1 else ""
         figure = friction_figure(alone(tables), names, title="Learned friction")
-        out.append(picture("error", "Learned friction", caption, figure))
-    if error and test and reached(error):
-        longest, given = int(np.argmax(np.sum(np.asarray(test.data.valid), axis=1))), error["given_s"]
-        caption = f"The longest one ({test.files[longest]}), predicted from its first {given:g} s."
-        figure = prediction_figure(alone(predicted), test.data, names, given, longest)
-        out.append(picture("error", "One test sequence", caption, figure))
-    return out
+        friction.append(picture("error", "Learned friction", caption, figure))
+    return [*errors, *friction, *motion]
 
 
 def _residual_pictures(left: Mapping[str, Residual], names: Names) -> list[Picture]:
@@ -144,12 +143,10 @@ def _effect_pictures(accepted: list[Finding]) -> list[Picture]:
     """Learned functions, and what is left beside a law."""
     out = []
     for finding in accepted:
-        if finding.curve is not None:
+        if (curve := finding.curve) is not None:
             name = words(key_of(finding.effect))
-            remainder = f"What is left of {name}, a function of {finding.curve.signal}"
-            title = remainder if finding.left else f"The learned {name}"
-            caption = "With its 90 % band, without its mean."
-            out.append(picture("found", title, caption, effect_figure(finding.curve)))
+            title = f"What is left of {name}, a function of {curve.signal}" if finding.left else f"The learned {name}"
+            out.append(picture("found", title, "With its 90 % band, without its mean.", effect_figure(curve)))
     return out
 
 

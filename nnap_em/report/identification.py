@@ -57,13 +57,13 @@ def write_identification(
         laws = friction_law(fitted, table, velocities)
         write_friction(out / "friction.csv", *map(np.asarray, (table.velocity, table.torque, table.std)))
         figures.append(_draw(out / "friction.png", fitted, table, velocities))
-    terms = unknown_terms(fitted)
+    terms, sides = unknown_terms(fitted), {"fit": fitted}
     caption = (
         "Over the range of its signals in a simulation; the parameters of the equations have all that they can do."
     )
-    drawn = [term for term in terms if len(term["signals"]) < 3]
-    figures += [picture("found", f"Unknown term {term['name']}", caption, term_figure(term)) for term in drawn]
-    sides = {"fit": fitted}
+    for term in terms:
+        if len(term["signals"]) < 3:
+            figures.append(picture("found", f"Unknown term {term['name']}", caption, term_figure(term)))
     error = errors(predictions(sides, train, test, seed), sides, test) if test else None
     if error and reached(error):
         caption = "On test sequences that the fit has not seen."
@@ -102,16 +102,16 @@ def _verdict(
     fitted: Identified, sequences: int, diverged: int, causes: Sequence[str] = (), far: Sequence[Moved] = ()
 ) -> str:
     """The outcome of a fit: first, where it does not describe the motion, that; last numbers that left the rig's."""
-    dof = len(fitted.model.system.coordinates)
-    friction = [f"the friction of {counted(dof, 'joint')}"] * fitted.rig.friction
+    friction = [f"the friction of {counted(len(fitted.model.system.coordinates), 'joint')}"] * fitted.rig.friction
     estimated = listed([*friction, *parameters(fitted)]) or "the noise"
     used = f"{sequences - diverged} of " * bool(diverged) + counted(sequences, "sequence")
-    early, rested = _stopped_early(fitted), f" in {counted(fitted.state.epoch, 'epoch')}"
+    rested = f" in {counted(fitted.state.epoch, 'epoch')}"
     rested += f", until {fitted.state.stop}" * (fitted.state.stop == STEP_REFUSED)
-    text = f"Fitted {estimated} to {used}{f'; {early}' if early else rested}."
-    first, after = [fitted.misfit.text] * bool(fitted.misfit.text), [f"{'; '.join(causes)}."] * bool(causes)
-    first, last = (first, []) if fitted.misfit.useless else ([], first)
-    return " ".join([*first, *after, text, *last, *(one.sentence for one in far)])
+    early = f"; {_stopped_early(fitted)}" if fitted.rise else rested
+    text, word = f"Fitted {estimated} to {used}{early}.", fitted.misfit.text
+    causes = f"{'; '.join(causes)}." if causes else ""
+    parts = [word, causes, text] if fitted.misfit.useless else [causes, text, word]
+    return " ".join(part for part in (*parts, *(one.sentence for one in far)) if part)
 
 
 def _stopped_early(fitted: Identified) -> str:
@@ -124,20 +124,18 @@ def _stopped_early(fitted: Identified) -> str:
 
 
 def _log_summary(document: dict[str, Any], log: Log) -> None:
-    if document["accuracy"]["text"] or document["moved"]:
-        log(document["verdict"])
-    for law in document["friction_law"] or []:
-        log(law["text"])
-    if document["stopped"]:
-        log(document["stopped"])
+    lines = [document["verdict"]] if document["accuracy"]["text"] or document["moved"] else []
+    lines += [*(law["text"] for law in document["friction_law"] or []), document["stopped"]]
     if document["left_out"]:
-        log(f"diverged, and left out of the last epoch: {listed(document['left_out'])}")
+        lines.append(f"diverged, and left out of the last epoch: {listed(document['left_out'])}")
     error = document["error"] or {"fit": {}}
     for name, values in error["fit"].items():
         pairs = zip(reached(error), values, strict=False)  # no test sequence reaches the others
-        log(f"error {name}: " + ", ".join(f"{v:.3g} over {h:g} s" for h, v in pairs if not math.isnan(v)))
+        lines.append(f"error {name}: " + ", ".join(f"{v:.3g} over {h:g} s" for h, v in pairs if not math.isnan(v)))
     for name, entry in document["parameters"].items():
-        log(f"{name} = {entry['value']:.6g} +- {entry['std']:.2g} {entry['unit']}")
+        lines.append(f"{name} = {entry['value']:.6g} +- {entry['std']:.2g} {entry['unit']}")
+    for line in filter(None, lines):
+        log(line)
 
 
 def _velocities(fitted: Identified, train: Logs, epochs: list[dict[str, Any]]) -> Float[np.ndarray, "sample dof"]:
@@ -152,8 +150,7 @@ def _velocities(fitted: Identified, train: Logs, epochs: list[dict[str, Any]]) -
 
 def _draw(path: Path, fitted: Identified, table: FrictionTable, visited: Float[np.ndarray, "sample dof"]) -> Picture:
     """The learned maps as a file of their own, and for the page."""
-    figure = friction_figure({"learned": table}, names_of(fitted), list(visited.T))
-    image = io.BytesIO()
+    figure, image = friction_figure({"learned": table}, names_of(fitted), list(visited.T)), io.BytesIO()
     figure.savefig(image, format="png", metadata={"Software": "written by nnap_em"})
     replace_bytes(path, image.getvalue())
     return picture("found", "Learned friction", "With its 90 % band; below: where the data were.", figure)

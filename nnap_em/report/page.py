@@ -8,16 +8,12 @@ from ..diagnosis.statistics import FAILS
 from ..effects import catalogue
 from ..numerics.digits import finite, number, with_std
 from .html import Part, Picture, Section, Table, rendered, section
-from .wording import label, p_value, quantity, ratio, reached, sentence, share
+from .wording import label, quantity, ratio, reached, sentence, share
 
 _NATS = ((100, "Beyond doubt"), (30, "Very sure"), (10, "Sure"), (3, "Likely"))
 _SHARES = ((0.6, "Very sure"), (0.3, "Sure"), (0.15, "Likely"))
 """Thresholds of words for a log-likelihood [nat], and for a share of the error on recordings left out."""
 
-HOLM = (
-    "A test fails where its p-value, the chance of such a result from a right model, corrected for the number of tests "
-    f"(Holm), is below {FAILS}. With many samples even a slight misfit is certain; the size says whether it matters."
-)
 _Entry = Mapping[str, Any]
 
 
@@ -38,13 +34,9 @@ def page(document: Mapping[str, Any], pictures: Sequence[Picture] = ()) -> str:
         section("Suspects", *_suspects(document.get("suspects"))),
         section("What to measure next", document.get("next")),
     ]
-    tests = document.get("tests") or {}
-    titles = {"before": "Declared model", "after": "With what was found"}
-    failed = [section(title, _failed(tests.get(side) or [])) for side, title in titles.items()]
     details = [
-        section("Tests of the one-step errors that fail", HOLM if any(failed) else None, *failed, folded=True),
         section("Screening rounds, in their order", *map(_round, document.get("rounds") or []), folded=True),
-        section("Estimated parameters", *([numbers, document.get("undetermined")] if diagnosed else []), folded=True),
+        section("Estimated parameters", *[numbers, document.get("undetermined")] * diagnosed, folded=True),
         section("Noise", _noise_table(document.get("noise") or {}), folded=True),
     ]
     return rendered("Diagnosis of" if diagnosed else "Identification of", document, sections, details)
@@ -58,9 +50,7 @@ def _found(document: _Entry) -> list[Part | None]:
     if effects:
         grows = growth(document.get("error") or {})
         doubted = bool(grows) and sum(grows.values()) >= 0  # in the geometric mean of the columns
-        nats = any(finite((effect.get("evidence") or {}).get("log_likelihood_gain")) for effect in effects)
-        unit = "nat: the unit of log-likelihood; every 2.3 nat make the data ten times as likely. " * nats
-        return [*(_effect(effect, doubted) for effect in effects), f"{unit}±: one standard deviation."]
+        return [*(_effect(effect, doubted) for effect in effects), "±: one standard deviation."]
     if document.get("suspects"):
         return ["No effect is added to the model. Some laws are suspected."]
     if document.get("complete") is False:
@@ -73,18 +63,16 @@ def _found(document: _Entry) -> list[Part | None]:
 
 def _effect(effect: _Entry, doubted: bool) -> Section | None:
     """An effect with its meaning, its parameters and what was measured about it."""
-    law, description = catalogue.get(effect.get("name") or ""), effect.get("description") or ""
+    law, text = catalogue.get(effect.get("name") or ""), effect.get("description") or ""
     meaning, words = (law.meaning, law.words) if law else ("", {})
-    only_numbers = (
-        "±" in description and meaning and not effect.get("shape") and effect.get("name") != "unknown_function"
-    )
+    if "±" in text and meaning and not effect.get("shape") and effect.get("name") != "unknown_function":
+        text = ""  # numbers that the table has
     rows = [
         [f"{words[key]} ({key})" if words.get(key, key) != key else key, quantity(entry)]
         for key, entry in (effect.get("parameters") or {}).items()
     ]
     evidence = " ".join(_evidence(effect.get("evidence") or {}, doubted))
-    text = "" if only_numbers else sentence(description)
-    return section(sentence(label(effect))[:-1], meaning, text, Table([], rows), evidence)
+    return section(sentence(label(effect))[:-1], meaning, sentence(text), Table([], rows), evidence)
 
 
 def _evidence(evidence: _Entry, doubted: bool) -> Iterable[str]:
@@ -118,20 +106,18 @@ def _equivalents(effects: Sequence[_Entry]) -> list[Part]:
 
 
 def _suspects(suspects: Sequence[_Entry] | None) -> list[Part]:
-    if not suspects:
-        return []
-    return [
+    text = (
         "These laws remove more of the prediction error than chance does on these recordings. They were not accepted "
-        "and are not in the model. Chance is measured on the same laws with their columns shifted in time.",
-        [each["description"] for each in suspects],
-    ]
+        "and are not in the model. Chance is measured on the same laws with their columns shifted in time."
+    )
+    return [text, [each["description"] for each in suspects]] if suspects else []
 
 
 # --- errors
 
 
 def _errors(document: _Entry) -> list[Part]:
-    """Errors of the predictions by horizon and column, and tests of the one-step errors that fail."""
+    """Errors of the predictions by horizon and column, and how many tests of the one-step errors fail."""
     error, units = document.get("error") or {}, document.get("units") or {}
     before, after = error.get("before") or error.get("fit") or {}, error.get("after") or {}
     both, horizons, out = bool(document.get("effects")), reached(error), []
@@ -167,46 +153,30 @@ def _change(before: Any, after: Any) -> str:
 def _failures(before: Sequence[_Entry], after: Sequence[_Entry] | None) -> str:
     """Numbers of tests that fail, without those that fail by little."""
     sides = {"before": before, "after": after} if after else {"": before}
-    counts = {side: sum(_fails(test) and not test.get("slight") for test in tests) for side, tests in sides.items()}
+    counts = {
+        side: sum(finite(t["p_value"]) and t["p_value"] < FAILS and not t.get("slight") for t in tests)
+        for side, tests in sides.items()
+    }
     texts = " and ".join(f"{count or 'none'} {side}".strip() for side, count in counts.items())
-    return (
-        f"Of {len(before)} tests that the errors from one sample to the next are pure noise, {texts} fail by more than "
-        "a little."
-    )
-
-
-def _fails(test: _Entry) -> bool:
-    p = test.get("p_value")
-    return finite(p) and p < FAILS  # type: ignore[operator]
-
-
-def _failed(tests: Sequence[_Entry]) -> Table:
-    """The tests that fail, surest first."""
-    rows = [
-        [t["channel"] or "", t["name"] + " (slightly)" * bool(t.get("slight")), number(t["size"], 2),
-         p_value(t["p_value"]), t["meaning"]]
-        for t in sorted(filter(_fails, tests), key=lambda test: test["p_value"])
-    ]  # fmt: skip
-    return Table(["column", "test", "size", "p-value", "in words"], rows, "left")
+    pure = f"Of {len(before)} tests that the errors from one sample to the next are pure noise"
+    return f"{pure}, {texts} fail by more than a little."
 
 
 # --- the logs and the search
 
 
 def _disturbances(entries: Sequence[_Entry] | None) -> list[Part]:
-    if not entries:
-        return []
+    text = (
+        "At these moments something pushed that no law explains: a hand, a collision, a cable that caught, or a "
+        "disturbance that is not in the log. No other recording shows such a force in the same state. What the machine "
+        "does by itself should not stand here; record such a motion twice, and it will not."
+    )
     rows = [
         [f"train/{e['file']}", str(e["joint"]), f"{number(e['from'], 4)} s", f"{number(e['to'], 4)} s",
          f"{with_std(e['size'], e['std'])} {e['unit']}"]
-        for e in entries
+        for e in entries or ()
     ]  # fmt: skip
-    return [
-        "At these moments something pushed that no law explains: a hand, a collision, a cable that caught, or a "
-        "disturbance that is not in the log. No other recording shows such a force in the same state. What the machine "
-        "does by itself should not stand here; record such a motion twice, and it will not.",
-        Table(["file", "joint", "from", "to", "size"], rows, "left"),
-    ]
+    return [text, Table(["file", "joint", "from", "to", "size"], rows, "left")] if rows else []
 
 
 def _unused(document: _Entry) -> list[Part]:
@@ -218,13 +188,13 @@ def _unused(document: _Entry) -> list[Part]:
             [f"{e['part']}/{e['file']}", e["column"] or "all", e["kind"], str(e["amount"]), f"{number(e['time'], 4)} s"]
             for e in masked
         ]
-        out += [
+        text = (
             "These readings were taken as missing: they are far from what the rows around them say, or their sensor "
             "stood still while the machine moved. gap: rows that the log lost; cut: rows after a gap that nothing "
             "could bridge. Errors of prediction are against all readings of the test files. --trust-readings uses the "
-            "readings as they are.",
-            Table(["file", "column", "what", "how many", "first at"], rows, "left"),
-        ]
+            "readings as they are."
+        )
+        out += [text, Table(["file", "column", "what", "how many", "first at"], rows, "left")]
     return out
 
 
@@ -245,19 +215,18 @@ def _round(entry: _Entry) -> Section | None:
 
 def _parameter_table(document: _Entry) -> Table:
     sides = _sides(document.get("parameters") or {})
-    rows = [
-        [name, *(quantity(side[name]) if name in side else "–" for side in sides.values())]
-        for name in dict.fromkeys(name for side in sides.values() for name in side)
-    ]
+    names = dict.fromkeys(name for side in sides.values() for name in side)
+    rows = [[n, *(quantity(side[n]) if n in side else "–" for side in sides.values())] for n in names]
     return Table(["parameter", *sides], rows)
 
 
 def _noise_table(noise: _Entry) -> Table:
-    sides, rows = _sides(noise), []
-    for kind, title in (("measurement", "reading"), ("process_per_step", "process per step,")):
-        for name in next(iter(sides.values()), {}).get(kind, {}):
-            entries = [side[kind].get(name) for side in sides.values()]
-            rows.append([f"{title} {name}", *(_std(entry) if entry else "–" for entry in entries)])
+    sides = _sides(noise)
+    rows = [
+        [f"{title} {name}", *(_std(side[kind][name]) if name in side[kind] else "–" for side in sides.values())]
+        for kind, title in (("measurement", "reading"), ("process_per_step", "process per step,"))
+        for name in next(iter(sides.values()), {}).get(kind, {})
+    ]
     return Table(["standard deviation", *sides], rows)
 
 

@@ -839,8 +839,8 @@ a law stays beside any remainder
 + form is None and 0 not in even(
 ## test_search.py::test_a_search_keeps_what_was_accepted_before[a matrix is singular in the second round]
 a round that fails loses what was found
-- return _Searched(hypothesis, state, steps, complete=False, failure=_told(context, error))
-+ return _Searched(hypothesis, None, steps, complete=False, failure=_told(context, error))
+- return hypothesis, state, _told(context, error)
++ return hypothesis, None, _told(context, error)
 ## test_loop.py::test_a_spring_is_named_and_sized
 external disturbances sought in white noise
 -     if not white:
@@ -884,7 +884,7 @@ a law of a rate is judged by the coordinates alone
 laws without a refit fill the shortlist
 - for case in tried if case.refit is not None)
 + for case in tried)
-# diagnosis/folds.py
+# diagnosis/screen.py
 ## test_shares.py::test_recordings_of_one_motion_are_left_out_together
 recordings of one motion are evidence of each other
 - if difference < REPEATS * square:

@@ -14,9 +14,9 @@ from statsmodels.stats.diagnostic import acorr_ljungbox
 from nnap_em.data.dataset import pad
 from nnap_em.data.rig import Declared, Rig
 from nnap_em.data.units import with_names
-from nnap_em.diagnosis.innovations import tests as run_tests
 from nnap_em.diagnosis.residual import Names, names_of, residual
 from nnap_em.diagnosis.statistics import FAILS, dependence, holm, spread, whiteness
+from nnap_em.diagnosis.statistics import tests as run_tests
 from nnap_em.effects.position import TorsionalSpring
 from nnap_em.fit.identify import begin
 from nnap_em.model.state_space import with_effects

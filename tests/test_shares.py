@@ -5,9 +5,8 @@ import numpy as np
 import pytest
 
 from nnap_em.data.dataset import Dataset
-from nnap_em.diagnosis.folds import fold_of, motions, times
 from nnap_em.diagnosis.losses import Linearised
-from nnap_em.diagnosis.screen import Rows, project, shares, shifted
+from nnap_em.diagnosis.screen import Rows, fold_of, motions, project, shares, shifted, times
 from nnap_em.effects import Candidate, catalogue
 from nnap_em.em.multistep import ratio
 

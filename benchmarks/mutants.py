@@ -487,7 +487,7 @@ forces unsaid larger than the errors tell
 - noise = np.maximum(whole -
 + noise = np.maximum(whole - 0 *
 # diagnosis/residual.py
-## test_residual.py::test_adding_an_effect_back_gives_its_force
+## test_residual.py::test_a_known_force_comes_back_within_its_standard_deviation_with_that_of_an_effect_and_without
 force of the effects with the wrong sign
 - change + by_effects[None]
 + change - by_effects[None]

@@ -8,7 +8,7 @@ import pytest
 import rod
 from rigs import slide_logs
 
-from nnap_em.diagnosis.context import SEARCH_EFFORT, SearchContext, extend
+from nnap_em.diagnosis.context import SearchContext, extend
 from nnap_em.diagnosis.hypothesis import Hypothesis
 from nnap_em.diagnosis.losses import MultiStep
 from nnap_em.fit.identify import friction_table, identify
@@ -24,7 +24,7 @@ def fitted(tmp_path_factory):
 def _extended(before, data, model):
     """A fit that goes on from `model`, and what it logs."""
     lines = []
-    context = SearchContext(before, {}, data, MultiStep(), SEARCH_EFFORT, lines.append)
+    context = SearchContext(before, {}, data, MultiStep(), lines.append)
     return extend(context, Hypothesis(model, before.m_step), data.t.shape[1]), lines
 
 

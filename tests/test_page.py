@@ -41,8 +41,7 @@ WHOLE = {
     },
     "units": {"theta1": "rad", "dtheta1": "rad/s"},
     "models": {"before": "before.npz", "after": "after.npz"},
-    "friction_change": "Friction was bent.",
-    "tests": {"before": [TEST, TEST | {"p_value": None}, TEST | {"slight": True}, PASSED],
+    "tests": {"before": [TEST, TEST | {"p_value": None}, TEST | {"slight": True, "name": "level"}, PASSED],
               "after": [PASSED]},
     "parameters": {"before": {"m1": MASS}, "after": {"m1": MASS | {"value": 1.1}}},
     "noise": {"before": NOISE, "after": NOISE},
@@ -68,7 +67,7 @@ FIT = {
     "left_out": ["03.csv"],
     "model": "model.npz",
 }
-NOTHING = WHOLE | {"effects": [], "rounds": [], "friction_change": ""}
+NOTHING = WHOLE | {"effects": [], "rounds": []}
 REPORTS = (
     WHOLE,
     NOTHING,
@@ -141,7 +140,7 @@ ORDER = {
         "The model lacks a spring. | What was found | stiffness (k) | 0.05995 ± 0.00037 N m/rad | Beyond doubt. It "
         "raises the log-likelihood of the training data by 1142 nat. | Before and after | the first 1.0 s | "
         "0.200 → 0.300 (1.5 × larger) | 0.807 → 0.00580 (139 ×) | Of 4 tests | 1 before and none after fail | "
-        "Friction was bent. | hard stop at joint 1 | spike | Unhook the cable. | Details | "
+        "hard stop at joint 1 | spike | Unhook the cable. | Details | "
         "cogging at joint 1 | 1.00 ± 0.10 kg | act together | "
         "0.00500 rad (estimated) | 172 s",
     ),

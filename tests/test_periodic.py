@@ -15,20 +15,14 @@ MODEL, _ = slide()
 
 
 def _surroundings(span: float = 5.0):
-    surroundings = around(MODEL)
-    return surroundings._replace(duration=(0.0, span), ending=span, inputs=("u",))
-
-
-def _sine(frequency: float = 0.96) -> PeriodicForce:
-    return PeriodicForce(jnp.asarray([0.4]), jnp.asarray([0.1]), jnp.asarray(frequency), harmonics=1, joint=1)
+    return around(MODEL)._replace(duration=(0.0, span), ending=span, inputs=("u",))
 
 
 def test_every_period_that_the_recording_holds_is_near_one_that_is_tried():
     """A wrong period is off by a fifth of a turn at the end of the recording; none is longer than the recording."""
     for span in (5.0, 12.0, 20.0):
-        tried = np.array(
-            [float(c.start.frequency) for c in PeriodicForce.candidates(_surroundings(span)) if c.start.joint == 1]
-        )
+        every = [candidate.start for candidate in PeriodicForce.candidates(_surroundings(span))]
+        tried = np.array([float(start.frequency) for start in every if start.joint == 1])
         assert tried.min() * span >= 1.0
         wanted = np.linspace(tried.min(), 4.0, 1000)
         assert np.abs(wanted[:, None] - tried).min(axis=1).max() * span < 0.201
@@ -39,10 +33,8 @@ def test_the_waveform_is_the_sum_of_its_harmonics_and_repeats():
     sine, cosine = rng.normal(size=(2, 4))
     force = PeriodicForce(jnp.asarray(sine), jnp.asarray(cosine), jnp.asarray(2.0), harmonics=4, joint=1)
     turns = rng.uniform(size=50)
-    series = sum(
-        s * np.sin(2 * np.pi * h * turns) + c * np.cos(2 * np.pi * h * turns)
-        for h, (s, c) in enumerate(zip(sine, cosine, strict=True), start=1)
-    )
+    angle = 2 * np.pi * np.outer(turns, np.arange(1, 5))
+    series = np.sin(angle) @ sine + np.cos(angle) @ cosine
     np.testing.assert_allclose(force.waveform(jnp.asarray(turns)), series, atol=1e-12)
     np.testing.assert_allclose(force.waveform(jnp.asarray(turns + 3.0)), series, atol=1e-10)
     many = np.asarray(force.waveform(jnp.linspace(0.0, 1.0, 1000, endpoint=False)))
@@ -50,7 +42,7 @@ def test_the_waveform_is_the_sum_of_its_harmonics_and_repeats():
 
 
 def test_once_found_its_overtones_are_tried_in_its_place():
-    known = _sine()
+    known = PeriodicForce(jnp.asarray([0.4]), jnp.asarray([0.1]), jnp.asarray(0.96), harmonics=1, joint=1)
     model = with_effects(MODEL, (known,))
     (full,) = known.richer(_surroundings())
     assert replaced(full.start, model) == 0  # in its place, not beside it
@@ -60,13 +52,3 @@ def test_once_found_its_overtones_are_tried_in_its_place():
     grown = seeded(full, np.zeros(len(full.probes)))
     np.testing.assert_array_equal(flat(grown), flat(full.start))
     assert full.start.harmonics == OVERTONES and not full.start.richer(_surroundings())
-
-
-def test_its_curve_is_the_waveform_over_two_periods():
-    known = _sine(0.5)
-    drawn = known.curve(0.01 * np.eye(3), MODEL.system)
-    assert drawn is not None
-    assert (drawn.signal, drawn.signal_unit, drawn.unit) == ("time", "s", "N")
-    assert drawn.x[-1] == 4.0
-    np.testing.assert_allclose(drawn.mean, known.waveform(jnp.asarray(0.5 * drawn.x)), atol=1e-12)
-    np.testing.assert_allclose(drawn.std, 0.1, rtol=1e-9)  # sine and cosine of one angle, known alike

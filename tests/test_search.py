@@ -3,6 +3,7 @@
 import dataclasses
 import math
 import time
+from unittest import mock
 
 import equinox as eqx
 import jax
@@ -14,8 +15,8 @@ from helpers import around, declared_model, slide
 
 from nnap_em.data.dataset import Dataset
 from nnap_em.data.rig import Declared, Rig
-from nnap_em.diagnosis import backward, search, verdict
-from nnap_em.diagnosis.context import SEARCH_EFFORT, SearchContext, ahead, chosen
+from nnap_em.diagnosis import backward, rounds, search, verdict
+from nnap_em.diagnosis.context import SearchContext, ahead, chosen
 from nnap_em.diagnosis.hypothesis import Evidence, Hypothesis, covariances
 from nnap_em.diagnosis.keys import completed, contains, elsewhere, key_of, remainder_of, replaced
 from nnap_em.diagnosis.losses import MultiStep
@@ -86,7 +87,7 @@ def _emstate(model) -> EMState:
 
 BEFORE = Identified(RIG, _emstate(MODEL), RULE, StartBank((1, 1), (0,)), None)
 CONTEXT = SearchContext(
-    BEFORE, {9: (BEFORE.state, np.ones(6, bool))}, DATA, MultiStep(), SEARCH_EFFORT, lambda text: None, change=True
+    BEFORE, {9: (BEFORE.state, np.ones(6, bool))}, DATA, MultiStep(), lambda text: None, change=True
 )
 
 
@@ -241,9 +242,9 @@ def _run(entries, errors=None, hypothesis=BARE, shortlist=8, steps=None, p=None,
         removed = screened.share.least if own is None else 1 - own
         return Trial(screened, after, removed, 12.0, np.inf, 0.5, object())
 
-    risen, effort = None if p is None else Risen(1.2, p, 1e-4), SEARCH_EFFORT._replace(shortlist=shortlist)
-    step = Step(9, (), (), None, len(entries))
-    return decided(entries, refitted, step, hypothesis.model, CONTEXT._replace(effort=effort, risen=risen)), tried
+    risen, step = None if p is None else Risen(1.2, p, 1e-4), Step(9, (), (), None, len(entries))
+    with mock.patch.object(rounds, "SHORTLIST", shortlist):
+        return decided(entries, refitted, step, hypothesis.model, CONTEXT._replace(risen=risen)), tried
 
 
 GAIN, ZONE, DRAG, HOOKE, FREE = "motor_gain", "dead_zone", "air_drag", "torsional_spring", "unknown_function"

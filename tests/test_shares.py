@@ -5,9 +5,8 @@ import numpy as np
 import pytest
 
 from nnap_em.data.dataset import Dataset
-from nnap_em.diagnosis.folds import fold_of, motions, times
 from nnap_em.diagnosis.losses import Linearised
-from nnap_em.diagnosis.screen import Rows, project, shares, shifted
+from nnap_em.diagnosis.screen import Rows, fold_of, motions, project, shares, shifted, times
 from nnap_em.effects import Candidate, catalogue
 from nnap_em.em.multistep import ratio
 
@@ -117,21 +116,13 @@ def test_recordings_of_one_motion_are_left_out_together():
     assert motion[:5].tolist() == [0, 1, 0, 3, 0]
     assert fold_of(used, motion, np.zeros((6, 1), int))[used, 0].tolist() == [0, 1, 0, 2, 0]
     used[3] = False
-    part = fold_of(used, motions(state, used), np.tile(np.arange(8) // 2, (6, 1)))
+    t = np.tile(0.1 * np.arange(8), (6, 1))
+    part = fold_of(used, motions(state, used), times(t, Dataset(t, t, t, np.ones(t.shape, bool)), 4))
     assert part[0].tolist() == part[2].tolist() == part[4].tolist() == [0, 0, 1, 1, 2, 2, 3, 3]
     assert part[1].tolist() == [4, 4, 5, 5, 6, 6, 7, 7]
-
-
-def test_what_is_one_motion():
-    """Five motions from one rest, of which the first diverged early, are no repetitions."""
-    rng = np.random.default_rng(0)
-    state = np.cumsum(rng.normal(size=(5, 200, 2)), axis=1)
-    state[:, :20] = state[0, :20]
-    state[0, 12:] = np.nan
-    assert motions(state, np.ones(5, bool)).tolist() == [0, 1, 2, 3, 4]
-    t = np.stack([np.arange(50) * 0.1, 5.0 + np.arange(50) * 0.1])
-    data = Dataset(t, t[..., None], t[..., None], np.ones(t.shape, bool))
-    assert times(t[:, ::10], data, 2).tolist() == [[0, 0, 0, 1, 1]] * 2
+    state[:, :20] = state[0, :20]  # from one rest, of which one diverged early: no repetitions
+    state[3, 12:] = np.nan
+    assert motions(state[[1, 2, 3]], np.ones(3, bool)).tolist() == [0, 1, 2]
 
 
 def test_what_happens_at_one_moment_of_every_recording_is_no_law():

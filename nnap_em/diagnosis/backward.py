@@ -25,10 +25,11 @@ from .verdict import KEEP, MULTI_STEP, Rejection, lead, needed
 
 
 class _Reduced(NamedTuple):
-    """A hypothesis without one of its laws."""
+    """A hypothesis without one of its laws, and the share of the squared error that goes with it; infinite where the
+    law stays in any case.
+    """
 
     lost: float
-    """Share of the squared error that goes with the law; infinite for one that stays in any case."""
     fit: SmoothedFit | None = None
     null: Null | None = None
 
@@ -43,12 +44,11 @@ def backward(context: SearchContext, hypothesis: Hypothesis) -> Hypothesis:
         fit, _ = smooth(context, hypothesis, context.longest)
         if not fit.used.any():
             break
-        full = null_of(hypothesis, fit, context.loss, context.effort.passes).end
+        full = null_of(hypothesis, fit, context.loss).end
         reduced = [_without(context, fit, full, place) for place in range(len(hypothesis.evidence))]
         least = needless([one.lost for one in reduced])
         if least is None:
-            of_law = functools.partial(_in_place, context, full, reduced)
-            return compared(hypothesis, of_law, context.log)
+            return compared(hypothesis, functools.partial(_in_place, context, full, reduced), context.log)
         lost = reduced[least].lost
         reason = f"without it {share_of(lost, 'the squared error', 1)} is lost, {KEEP * MULTI_STEP:.1%} counts"
         reason = reason if lost > -math.inf else Rejection("impossible").sentence
@@ -66,11 +66,8 @@ def needless(lost: Sequence[float]) -> int | None:
 def _without(context: SearchContext, fit: SmoothedFit, full: Refit, place: int) -> _Reduced:
     """The fit without the effect at `place`, and the share of its squared error that the effect removes at best."""
     hypothesis, effects = fit.hypothesis, fit.model.effects
-    if (
-        hypothesis.evidence[place] is None
-        or effects[place].read_off
-        or any(remainder_of(other, fit.model) == place for other in effects)
-    ):
+    kept = hypothesis.evidence[place] is None or effects[place].read_off
+    if kept or any(remainder_of(other, fit.model) == place for other in effects):
         return _Reduced(math.inf)  # of an earlier fit, seen in the numbers themselves, or its remainder goes first
     if not effects[place].is_physical():
         return _Reduced(-math.inf)
@@ -78,7 +75,7 @@ def _without(context: SearchContext, fit: SmoothedFit, full: Refit, place: int) 
     both = fit._replace(hypothesis=smoothed.hypothesis, path=smoothed.path, used=fit.used & smoothed.used)
     if not both.used.any():  # without it no sequence is followed
         return _Reduced(math.inf)
-    null = null_of(both.hypothesis, both, context.loss, context.effort.passes)
+    null = null_of(both.hypothesis, both, context.loss)
     errors = judged_by(effects[place], fit.model, context.before.rig.measured, len(context.loss.bands))
     return _Reduced(max(1 - context.loss.ratio(null.end, full, both, *one) for one in errors), both, null)
 
@@ -138,7 +135,7 @@ def _in_place(
     listed = screen(loss, fit, some, shifts=0) if some else ()
     own = 1 - loss.ratio(null.end, full, fit, 0) if some else 0.0
     for entry in best_of_kind(s for s in listed if s.reached or key_of(s.candidate.start) in evidence.equivalent):
-        trial = with_candidate([entry], null, fit, loss, context.effort.passes)
+        trial = with_candidate([entry], null, fit, loss)
         its = -math.inf if trial.rejection else 1 - loss.ratio(null.end, cast(Refit, trial.refit), fit, 0)
         yield trial, lead(own, its)
 

@@ -66,18 +66,16 @@ def _columns(base: StateSpaceModel, effect: AbstractEffect, track: Track, scenes
     """Columns that `effect` adds, by its own hooks, to the machine `base` along a track."""
     alone, system, substeps = (effect,), base.system, max(effect.substeps, base.substeps)
     drive, plain = (base.driving(laws, track.middle, track.inputs) for laws in (alone, ()))
-    driven = scenes._replace(drive=drive)
+    driven, whole = scenes._replace(drive=drive), {"system": system, "map": base.unknown}  # no numbers for a batch
 
     def remember(m, scene):
-        return integrate(lambda m: hooks.drift(alone, _scene(base, scene), m), m, base.dt, substeps), m
+        return integrate(lambda m: hooks.drift(alone, scene._replace(**whole), m), m, base.dt, substeps), m
 
     memory = jnp.zeros((track.middle.shape[0], effect.memory), track.middle.dtype)
     if effect.memory:
         _, memory = jax.lax.scan(remember, memory[0], driven)
 
-    def one(scene, memory, acceleration):
-        return hooks.added(alone, _scene(base, scene), memory, acceleration)
-
+    one = lambda scene, *rest: hooks.added(alone, scene._replace(**whole), *rest)  # noqa: E731
     force = jax.vmap(one)(driven, memory, track.acceleration) + drive - plain
 
     def read(true, rate):
@@ -87,34 +85,18 @@ def _columns(base: StateSpaceModel, effect: AbstractEffect, track: Track, scenes
     return Columns(force, jax.vmap(read)(track.true, track.rate))
 
 
-def _scene(base: StateSpaceModel, numbers: OperatingPoint) -> OperatingPoint:
-    """A scene whose numbers came through a batch."""
-    return numbers._replace(system=base.system, map=base.unknown)
-
-
 COLUMNS_AT_ONCE = 1024
 """Columns that are computed and propagated at once: some 100 MB a sequence of a six-axis arm; machines of two joints
 have fewer in all."""
 
 
 class Stack(NamedTuple):
-    """Probes of one structure."""
+    """Probes of one structure, and their places among all."""
 
     places: list[int]
-    """Theirs among all."""
     probes: AbstractEffect
     axes: AbstractEffect
     """Axis of the stack in every leaf; None where all are the same: what a basis shares is then computed once."""
-
-
-def _stacks(probes: Sequence[AbstractEffect]) -> list[Stack]:
-    """Probes of one structure stacked, those of a class behind each other."""
-    places: dict = {}
-    for i, probe in enumerate(probes):
-        places.setdefault(jax.tree.structure(probe), []).append(i)
-
-    stacks = [_stack(index, [probes[i] for i in index]) for index in places.values()]
-    return sorted(stacks, key=lambda stack: type(stack.probes).__qualname__)
 
 
 def _stack(places: list[int], probes: Sequence[AbstractEffect]) -> Stack:
@@ -156,9 +138,13 @@ def candidate_columns(
 
     They are padded by columns of 0 to `size`.  Tracks are padded to `rows` meanwhile: one program for all lengths.
     """
-    stacks = _stacks([probe for candidate in candidates for probe in candidate.probes])
-    groups = [list(same) for _, same in itertools.groupby(stacks, lambda stack: type(stack.probes))]
-    size = max(size, sum(len(stack.places) for stack in stacks))
+    places, groups = {}, {}
+    probes = [probe for candidate in candidates for probe in candidate.probes]
+    for i, probe in enumerate(probes):
+        places.setdefault(jax.tree.structure(probe), []).append(i)
+    for index in places.values():
+        groups.setdefault(type(probes[index[0]]), []).append(_stack(index, [probes[i] for i in index]))
+    size = max(size, len(probes))
 
     def along(track: Track) -> Columns:
         length, middle = track.middle.shape[1], track.middle
@@ -166,7 +152,7 @@ def candidate_columns(
         padded = jax.tree.map(longer, track)
         last = track.acceleration.shape[-1], len(base.measured)
         force, reading = (np.zeros((len(middle), size, length, n), middle.dtype) for n in last)
-        for group in groups:  # a program for every class
+        for group in groups.values():  # a program for every class
             every = each(_stack_columns, (base, [(stack.probes, stack.axes) for stack in group]), padded)
             for stack, columns in zip(group, every, strict=True):
                 for full, values in ((force, columns.force), (reading, columns.reading)):

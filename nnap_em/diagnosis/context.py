@@ -3,7 +3,7 @@
 import functools
 import math
 from collections.abc import Callable, Sequence
-from typing import NamedTuple, TypeVar, cast
+from typing import Any, NamedTuple, cast
 
 import equinox as eqx
 import jax
@@ -20,36 +20,19 @@ from ..fit.identify import Identified, begin
 from ..model.state_space import StateSpaceModel
 from ..numerics.digits import counted
 from ..storage.log import Log
-from .hypothesis import Hypothesis
+from .hypothesis import Hypothesis, declared
 from .losses import MultiStep
 from .smoothed import SmoothedFit
 from .verdict import DETERMINED
-
-_Tree = TypeVar("_Tree")
 
 Stages = dict[int, tuple[EMState, Bool[np.ndarray, " seq"]]]
 """State of a fit at the end of each of its horizons, and the sequences used."""
 
 SHORT = 150
 """Rows to which short horizons are cut, so that they share their programs."""
-
-
-class Effort(NamedTuple):
-    """Limits of a search."""
-
-    shortlist: int = 8
-    """Candidates that are refitted at most."""
-    passes: int = 8
-    """Passes of a refit."""
-    most: int = 4
-    """Effects at most."""
-    large_kick: float = 5.0
-    """Kick [its standard deviations] from which on a sequence counts as diverged."""
-    later: tuple[int, ...] = (8, 3, 1)
-    """Rows after that which still count; the fewer where the many are too much."""
-
-
-SEARCH_EFFORT = Effort()
+LARGE_KICK, LATER = 5.0, (8, 3, 1)
+"""Kick [its standard deviations] from which on a sequence counts as diverged; rows after it that still count, the fewer
+where the many are too much."""
 
 
 class SearchContext(NamedTuple):
@@ -59,7 +42,6 @@ class SearchContext(NamedTuple):
     stages: Stages
     data: Dataset
     loss: MultiStep
-    effort: Effort
     log: Log
     until: float = math.inf
     """Moment of `time.monotonic()` after which no new round or refit begins."""
@@ -85,43 +67,42 @@ class SearchContext(NamedTuple):
     @property
     def declared(self) -> Hypothesis:
         """The declared model."""
-        return Hypothesis(self.before.model, self.before.m_step, (None,) * len(self.before.model.effects))
-
-
-def _cut(tree: _Tree, length: int, longest: int) -> _Tree:
-    """All of it, over no more rows than a horizon needs that is short, and not whole sequences."""
-    short = length <= SHORT and length < longest
-    return jax.tree.map(lambda a: np.asarray(a)[:, :SHORT], tree) if short else tree  # a view, no program
+        return declared(self.before)
 
 
 def smooth(context: SearchContext, hypothesis: Hypothesis, length: int) -> tuple[SmoothedFit, Bool[np.ndarray, " seq"]]:
     """`hypothesis` along its smoothed paths over `length` rows, and the sequences that are followed whole.
 
-    A diverged sequence is most informative around its divergence: it is used up to 8, 3 or 1 rows after that moment,
-    the longest stretch that the smoother still follows.
+    A diverged sequence is most informative around its divergence: it is used up to `LATER` rows after that moment, the
+    longest stretch that the smoother still follows.
     """
     before = context.before
     smoother, every = before.smoother, horizon(context.data, length)  # uncut: the program of the fit serves
+
+    def cut_short(tree: Any) -> Any:
+        short = length <= SHORT and length < context.longest
+        return jax.tree.map(lambda a: np.asarray(a)[:, :SHORT], tree) if short else tree  # a view, no program
+
     posterior = e_step(hypothesis.model, every, smoother, key=before.state.key)
     whole = np.asarray(not_diverged(posterior, every))
-    both = _cut((posterior.state, every), length, context.longest)
-    fit = SmoothedFit(context.declared, hypothesis, *both, whole, context.longest)
+    path, data = cut_short((posterior.state, every))
+    fit = SmoothedFit(context.declared, hypothesis, path, data, whole, context.longest)
     if whole.all():
         return fit, whole
     dof = len(hypothesis.model.system.coordinates)
     kick = np.mean(np.asarray(posterior.kick), axis=2) / np.exp(0.5 * np.asarray(hypothesis.model.log_q))
-    large = ~(np.abs(kick[..., dof : 2 * dof]).max(axis=-1) < context.effort.large_kick)
+    large = ~(np.abs(kick[..., dof : 2 * dof]).max(axis=-1) < LARGE_KICK)
     first = np.where(large.any(axis=1), large.argmax(axis=1), every.t.shape[1])
     row, used, cut = np.arange(every.t.shape[1]), whole, every
-    for later in context.effort.later:
+    for later in LATER:
         early = np.asarray(every.valid) & (row < first[:, None] + later)
         cut = cut._replace(valid=np.where(used[:, None], cut.valid, early))
         posterior = e_step(hypothesis.model, cut, smoother, key=before.state.key)
         used = np.asarray(not_diverged(posterior, cut))
         if used.all():
             break
-    path, cut = _cut((posterior.state, cut), length, context.longest)
-    return fit._replace(path=path, data=cut, used=used), whole
+    path, data = cut_short((posterior.state, cut))
+    return fit._replace(path=path, data=data, used=used), whole
 
 
 def extend(context: SearchContext, hypothesis: Hypothesis, first: int) -> EMState:
@@ -139,8 +120,12 @@ def extend(context: SearchContext, hypothesis: Hypothesis, first: int) -> EMStat
         begun = later_state(model, rule, key=before.state.key)
         return fit(begun, context.data, before.smoother, rule, epochs=growing + 8, schedule=schedule)
 
+    def looser() -> EMState:  # a filter of more process noise follows more
+        model = cast(StateSpaceModel, fits[-1].best) if fits else hypothesis.model
+        return run(eqx.tree_at(lambda m: m.log_q, model, model.log_q + 3.0))
+
     afresh = _afresh(context, hypothesis)
-    for start in (lambda: run(hypothesis.model), *([afresh] if afresh else []), lambda: run(_looser(hypothesis, fits))):
+    for start in (lambda: run(hypothesis.model), *([afresh] if afresh else []), looser):
         try:
             fits.append(start())
         except FitError as error:
@@ -152,17 +137,9 @@ def extend(context: SearchContext, hypothesis: Hypothesis, first: int) -> EMStat
     if not fits:
         raise failure
     state = _best(context, hypothesis, fits)
-    epochs, reached = counted(state.epoch - 1, "epoch"), np.nanmean(state.top)
-    context.log(
-        f"  fitted over the whole length in {epochs} ({state.stop}): log-likelihood {reached:.1f} nat per sequence"
-    )
+    reached = f"log-likelihood {np.nanmean(state.top):.1f} nat per sequence"
+    context.log(f"  fitted over the whole length in {counted(state.epoch - 1, 'epoch')} ({state.stop}): {reached}")
     return state
-
-
-def _looser(hypothesis: Hypothesis, fits: Sequence[EMState]) -> StateSpaceModel:
-    """The last model that was fitted, or the hypothesis, with more noise of the process: a looser filter follows."""
-    model = cast(StateSpaceModel, fits[-1].best) if fits else hypothesis.model
-    return eqx.tree_at(lambda m: m.log_q, model, model.log_q + 3.0)
 
 
 def _afresh(context: SearchContext, hypothesis: Hypothesis) -> Callable[[], EMState] | None:

@@ -27,7 +27,7 @@ from ..em.readings import reading_noise
 from ..fit.identify import Identified, fitted_to_horizon
 from ..model.state_space import with_effects
 from ..storage.log import Log
-from .hypothesis import Evidence, Hypothesis, covariances
+from .hypothesis import Evidence, Hypothesis, covariances, declared
 from .keys import Key, complexity, key_of, words
 from .outcome import Diagnosis, Step, Suspect
 from .trial import certainty
@@ -67,9 +67,15 @@ class Case(NamedTuple):
         return tuple(law.start.with_numbers(effect) for law, effect in zip(self.laws, fitted, strict=True))
 
     @property
-    def odds(self) -> float:
-        """Prior odds."""
-        return PAIR ** (len(self.laws) - 1) / math.prod(required(1.0, complexity(law.start)) for law in self.laws)
+    def worth(self) -> float:
+        """Share times prior odds."""
+        bars = math.prod(required(1.0, complexity(law.start)) for law in self.laws)
+        return self.share * (PAIR ** (len(self.laws) - 1) / bars)
+
+    @property
+    def sound(self) -> bool:
+        """True for physical values."""
+        return all(effect.is_physical() for effect in self.effects)
 
     @property
     def numbers(self) -> int:
@@ -127,10 +133,9 @@ class Search(NamedTuple):
                 cases[i] = Case(tuple(every[i][0]), of, -density)
         return cases
 
-    def loss(self, of: simulated.Simulated, counts: Bool[np.ndarray, "seq window #place 1"] | None = None) -> float:
+    def loss(self, of: simulated.Simulated, counts: Bool[np.ndarray, "seq window #place 1"] | bool = True) -> float:
         """Squared error of the predictions that count."""
-        known = of.observed
-        return simulated.cost(of.error, self.scale, known if counts is None else known & counts)
+        return simulated.cost(of.error, self.scale, of.observed & counts)
 
     def screened(self, hypothesis: Hypothesis, candidates: Sequence[Candidate]) -> list[Case]:
         """The hypothesis with each candidate, fitted; the best case of every law, best first."""
@@ -186,15 +191,12 @@ def around_of(fitted: Identified, data: Dataset) -> SearchScales:
     seen, valid = motion(model, data), np.asarray(data.valid)
     low, high = np.percentile(seen.x, [0.5, 99.5], axis=0)[:, : len(model.system.states)]
     u, y, t = (np.asarray(a)[valid] for a in (data.u, data.y, data.t))
-    pairs = zip(rig.measured, y.T, strict=True)
-    ends = {name: (float(np.nanmin(one)), float(np.nanmax(one))) for name, one in pairs}
-    pairs = zip(model.system.states, low, high, strict=True)
-    sizes = {name: (float(a), float(b)) for name, a, b in pairs if b > a}
-    sizes |= {
-        name: (float(a.min()), float(a.max())) for name, a in zip(rig.input_columns, u.T, strict=True) if np.ptp(a)
-    }
-    none, wait = np.zeros(0), max(rig.dt, model.pace / GROWN)
-    drive = np.max(np.abs(u), axis=0, initial=0.0)
+    ranges = [(float(np.nanmin(a)), float(np.nanmax(a))) for a in (*y.T, *u.T)]
+    ends = dict(zip(rig.measured, ranges, strict=False))
+    inputs = zip(rig.input_columns, ranges[len(ends) :], strict=True)
+    states = zip(model.system.states, zip(low.tolist(), high.tolist(), strict=True), strict=True)
+    sizes = {name: (a, b) for name, (a, b) in (*states, *inputs) if b > a}
+    none, wait, drive = np.zeros(0), max(rig.dt, model.pace / GROWN), np.max(np.abs(u), axis=0, initial=0.0)
     return SearchScales(
         model.system, np.asarray(cast(Any, model.unknown).scale), none, none, low, high, drive,
         rig.measured, np.array([b - a for a, b in ends.values()]), wait,
@@ -218,14 +220,12 @@ def free_functions(before: Identified, around: SearchScales, data: Dataset) -> l
 
 def search_equations(before: Identified, data: Dataset, log: Log, until: float = math.inf) -> Diagnosis:
     """Laws that equations lack, added and fitted, one or two at a time, until none passes on parts left out."""
-    hypothesis = Hypothesis(before.model, before.m_step, (None,) * len(before.model.effects))
-    declared = len(before.model.effects)
-    search = Search(before, data, log, until)
+    hypothesis, own, search = declared(before), len(before.model.effects), Search(before, data, log, until)
     around, steps, complete = around_of(before, data), [], True
     kinds = [kind for kind in catalogue.values() if issubclass(kind, PortEffect | SensorEffect | DriveEffect)]
     every = [candidate for kind in kinds for candidate in kind.candidates(around)]
     free = free_functions(before, around, data)
-    while complete and len(hypothesis.model.effects) - declared < MOST_LAWS:
+    while complete and len(hypothesis.model.effects) - own < MOST_LAWS:
         chosen, alike, step = _round(search, hypothesis, every, free)
         steps, complete = [*steps, step], time.monotonic() <= until
         if chosen is None:
@@ -234,19 +234,15 @@ def search_equations(before: Identified, data: Dataset, log: Log, until: float =
             record = Evidence(equivalent=alike, share=chosen.share, removed=chosen.share)
             hypothesis = hypothesis.plus(effect, law, record)
             log(f"  added {words(key_of(effect))}")
-        hypothesis = hypothesis.refitted(_with_numbers(hypothesis, chosen))
-    if len(hypothesis.model.effects) == declared:
+        lean, effects = chosen.of.model, hypothesis.model.effects
+        effects = tuple(effect.with_numbers(fitted) for effect, fitted in zip(effects, lean.effects, strict=True))
+        model = with_effects(hypothesis.model, effects)
+        hypothesis = hypothesis.refitted(eqx.tree_at(lambda m: m.system, model, lean.system))
+    if len(hypothesis.model.effects) == own:
         return Diagnosis(before, before, (), tuple(steps), complete=complete)
     state = before.state._replace(best=hypothesis.model)
     after = fitted_to_horizon(before._replace(state=state, m_step=hypothesis.m_step), data)
     return Diagnosis(before, after, hypothesis.evidence, tuple(steps), complete=complete)  # type: ignore[arg-type]
-
-
-def _with_numbers(hypothesis: Hypothesis, case: Case) -> Any:
-    """The model of the hypothesis with the parameters of the case."""
-    lean = case.of.model
-    effects = tuple(e.with_numbers(o) for e, o in zip(hypothesis.model.effects, lean.effects, strict=True))
-    return eqx.tree_at(lambda m: m.system, with_effects(hypothesis.model, effects), lean.system)
 
 
 def _round(
@@ -256,16 +252,14 @@ def _round(
 
     Pairs, and functions without a name, are tried where no single law removes most of what can be removed.
     """
-    lean = hypothesis.refitted(
-        with_effects(
-            hypothesis.model, tuple(effect.lean(hypothesis.model.system) for effect in hypothesis.model.effects)
-        )
-    )
+    system, present = hypothesis.model.system, {key_of(effect) for effect in hypothesis.model.effects}
+    effects = tuple(effect.lean(system) for effect in hypothesis.model.effects)
+    lean = hypothesis.refitted(with_effects(hypothesis.model, effects))
+    fresh = lambda c: key_of(c.start) not in present  # noqa: E731
     begin = simulated.filtered(lean.model, search.data)
     first = simulated.simulated(lean.model, lean.m_step.prior, search.data, begin)
     search = search._replace(begin=begin, scale=simulated.scale_of(first))
-    present = {key_of(effect) for effect in hypothesis.model.effects}
-    log, rows = search.log, int(np.asarray(search.data.valid).sum(axis=1).max())
+    rows = int(np.asarray(search.data.valid).sum(axis=1).max())
     nothing = None, (), Step(rows, (), (), None, 0, MEASURE)
     if not (fits := search.fit(lean, [((), ())])):
         return nothing
@@ -273,47 +267,41 @@ def _round(
     search = search._replace(scale=simulated.scale_of(null.of))
     if not (parts := search.left_out(lean, [null])):
         return nothing
-    base, fresh = parts[0], [c for c in every if key_of(c.start) not in present]
-    whole, room = search.loss(null.of), search.room(null.of)
-    log(f"{len(fresh)} candidates; {max(room, 0.0):.0%} of the squared error is not noise of the readings")
+    some, whole, room = [*filter(fresh, every)], search.loss(null.of), search.room(null.of)
+    search.log(f"{len(some)} candidates; {max(room, 0.0):.0%} of the squared error is not noise of the readings")
     if room < MULTI_STEP:
         return nothing
-    singles = search.screened(lean, fresh)
-    short = [case for n in range(1, 4) for case in [c for c in singles if c.numbers == n and _sound(c)][:SHORTLIST]]
-    judged = search.judged(lean, short, base)
+    singles = search.screened(lean, some)
+    short = [case for n in range(1, 4) for case in [c for c in singles if c.numbers == n and c.sound][:SHORTLIST]]
+    judged = search.judged(lean, short, parts[0])
     passing, tried = [case for case in judged if _passes(case)], [*judged]
-    most = max([MULTI_STEP, *(case.share for case in passing)]) / PAIR
-    if room > most:  # else no pair and no function could be chosen
+    if room > max([MULTI_STEP, *(case.share for case in passing)]) / PAIR:  # else no pair, no function could be chosen
         both = itertools.combinations(singles[:PARTNERS], 2)
         joined = [((*a.laws, *b.laws), (*a.effects, *b.effects)) for a, b in both]
         pairs = sorted(search.fit(lean, joined, steps=SCREEN_STEPS).values(), key=lambda case: case.loss)
-        functions = search.screened(lean, [c for c in free if key_of(c.start) not in present])
-        best = [*[case for case in pairs if _sound(case)][:PAIRS_JUDGED], *functions[:FREE]]
-        tried += search.judged(lean, best, base)
+        functions = search.screened(lean, [*filter(fresh, free)])
+        best = [*[case for case in pairs if case.sound][:PAIRS_JUDGED], *functions[:FREE]]
+        tried += search.judged(lean, best, parts[0])
         passing = [case for case in tried if _passes(case)]
     for case in tried:
-        _report(search, case)
+        values = ["; ".join(f"{n} {float(v):.3g}" for n, v in effect.values().items()) for effect in case.effects]
+        laws = " and ".join(f"{words(key)} ({value})" for key, value in zip(case.keys, values, strict=True))
+        search.log(f"  {laws}: {case.share:.0%} of the squared error on parts left out")
     listed = tuple((case.keys[0], 1 - search.loss(case.of) / whole) for case in singles)
-    refitted = tuple((case.keys[-1], case.share) for case in tried)
+    step = Step(rows, listed, tuple((case.keys[-1], case.share) for case in tried), None, len(some), MEASURE)
     best, alike = _chosen(passing)
-    suspects = ()
     if best is None:
-        near = sorted((c for c in judged if c.share > SUSPECT_SHARE and _sound(c)), key=lambda c: -c.share)
+        near = sorted((c for c in judged if c.share > SUSPECT_SHARE and c.sound), key=lambda c: -c.share)
         suspects = tuple(Suspect(case.keys[0], case.share, math.nan) for case in near[:4])
-    accepted = best.keys[0] if best else None
-    step = Step(rows, listed, refitted, accepted, len(fresh), MEASURE, suspects=suspects)
-    return best, tuple(case.keys[0] for case in alike if case is not best and len(case.laws) == 1), step
-
-
-def _sound(case: Case) -> bool:
-    """True for physical values that differ from none."""
-    return all(effect.is_physical() for effect in case.effects)
+        return None, (), step._replace(suspects=suspects)
+    same = tuple(case.keys[0] for case in alike if case is not best and len(case.laws) == 1)
+    return best, same, step._replace(accepted=best.keys[0])
 
 
 def _passes(case: Case) -> bool:
     """True where the parts left out confirm that the laws remove a share of the squared error."""
     agree = sum(gain > 0 for gain in case.folds) >= AGREE * len(case.folds)
-    return case.share * case.odds >= MULTI_STEP and agree and _sound(case) and _certain(case)
+    return case.worth >= MULTI_STEP and agree and case.sound and _certain(case)
 
 
 def _certain(case: Case) -> bool:
@@ -325,20 +313,14 @@ def _certain(case: Case) -> bool:
 def _chosen(passing: Sequence[Case]) -> tuple[Case | None, list[Case]]:
     """The case of the fewest numbers among those that explain the same as the best, and all of these.
 
-    They are worth as much, and as likely on parts left out: few independent errors make much likely, and of a law that
-    removes nearly all the rest counts.
+    They are worth as much, and as likely on parts left out: few errors make much likely, and of a law that removes
+    nearly all the rest counts.
     """
     if not passing:
         return None, []
-    worths = [case.share * case.odds for case in passing]
+    worths = [case.worth for case in passing]
     top = passing[int(np.argmax(worths))]
     errors = simulated.independent(top.of)
     nats = [0.5 * errors * math.log(case.left / top.left) for case in passing]  # likelihood that each loses to the best
     alike = [passing[i] for i in even(worths) if nats[i] < EQUIVALENT_NATS]
     return min(alike, key=lambda case: (case.numbers, case.left)), alike
-
-
-def _report(search: Search, case: Case) -> None:
-    values = ["; ".join(f"{n} {float(v):.3g}" for n, v in effect.values().items()) for effect in case.effects]
-    laws = " and ".join(f"{words(key)} ({value})" for key, value in zip(case.keys, values, strict=True))
-    search.log(f"  {laws}: {case.share:.0%} of the squared error on parts left out")

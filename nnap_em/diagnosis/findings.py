@@ -12,7 +12,6 @@ from jaxtyping import Array, Float
 
 from ..effects import AbstractEffect, catalogue, fields, flat
 from ..effects.base import Curve
-from ..fit.identify import friction_table
 from ..numerics.digits import finite, number, share_of, with_std
 from .hypothesis import covariances
 from .keys import Key, key_of, listed, place_of, remainder_of, with_article, words
@@ -30,20 +29,16 @@ class Estimate(NamedTuple):
 
 def estimates(effect: AbstractEffect, cov: Float[np.ndarray, "param param"], system: Any) -> dict[str, Estimate]:
     """The reported parameters of an effect; standard deviations by the delta method from those of its own numbers."""
-
     (values, slopes), unit = _reported(effect), effect.units_on(system)
-    variance = {name: float(np.asarray(slope) @ cov @ np.asarray(slope)) for name, slope in slopes.items()}
-    stds = {name: math.sqrt(max(0.0, v)) for name, v in variance.items()}
+    slopes = {name: np.asarray(slope) for name, slope in slopes.items()}
+    stds = {name: math.sqrt(max(0.0, float(slope @ cov @ slope))) for name, slope in slopes.items()}
     return {n: Estimate(float(values[n]), stds[n], unit[n]) for n in unit if n in values}  # in the order of the law
 
 
 @eqx.filter_jit
 def _reported(effect: AbstractEffect):
     """The reported parameters, and how they move with the effect's own numbers."""
-
-    def reported(numbers: Float[Array, " param"]) -> dict[str, Float[Array, ""]]:
-        return filled(effect, numbers).values()
-
+    reported = lambda numbers: filled(effect, numbers).values()  # noqa: E731
     return reported(flat(effect)), jax.jacfwd(reported)(flat(effect))
 
 
@@ -72,14 +67,8 @@ class Finding(NamedTuple):
 
 
 def findings(diagnosis: Diagnosis) -> list[Finding]:
-    """The effects that a diagnosis added, each with its numbers, sentence and equivalents.
-
-    Args:
-        diagnosis: of `diagnose`.
-
-    Returns:
-        One an effect, in the order of their acceptance; empty where nothing was found: `print(diagnosis)` shows
-        whether the logs were undecided.
+    """The effects that a diagnosis added, each with its numbers, sentence and equivalents, in the order of their
+    acceptance; none where nothing was found: `print(diagnosis)` shows whether the logs were undecided.
 
     Example:
         >>> [finding.sentence for finding in nnap_em.findings(diagnosis)]
@@ -95,7 +84,7 @@ def findings(diagnosis: Diagnosis) -> list[Finding]:
             continue  # reported with the law that it completes, or of the fit from which the search began
         drawn = effect.curve(cov, model.system)
         parameters = estimates(effect, cov, model.system)
-        sizes = ", ".join(f"{n} = {with_std(p.value, p.std)} {p.unit}".rstrip(" -") for n, p in parameters.items())
+        sizes = ", ".join(map(" = ".join, _texts(parameters).items()))
         remainder = next((e.curve(c, model.system) for e, _, c, of in entries if of is effect), None)
         form, remains = (shape(one) if one else None for one in (drawn, remainder))
         sentence = ": ".join(filter(None, (words(key_of(effect)), sizes, form.words if form else "")))
@@ -133,17 +122,12 @@ def verdict(
     It names the column whose test error falls most, and trusts a finding where the geometric mean over all falls.
     """
     if unfinished:
-        first = (
-            verdict(accepted, error, failed, rivals, suspects)
-            if accepted or rivals or suspects
-            else "No effect was found yet."
-        )
+        known = accepted or rivals or suspects
+        first = verdict(accepted, error, failed, rivals, suspects) if known else "No effect was found yet."
         return f"{first} {unfinished}: more may be missing."
     if not accepted and rivals:
-        return (
-            f"Something is missing, but these recordings cannot tell what: {listed([*map(words, rivals)])} explain the "
-            "same; none is added."
-        )
+        same = f"{listed([*map(words, rivals)])} explain the same; none is added."
+        return f"Something is missing, but these recordings cannot tell what: {same}"
     if not accepted and suspects:
         first, *remaining = suspects
         others = f" ({len(remaining)} more below)" if remaining else ""
@@ -155,13 +139,9 @@ def verdict(
         )
     if not accepted:
         return "Nothing is missing that these data could show: the declared model explains them."
-    names = listed([_sized(finding) for finding in accepted])
-    it = "it" if len(accepted) == 1 else "them"
-    text = f"{opening} {names}"
-    if not error:
-        return text + "."
-    grows = growth(error)
-    if not grows:
+    names, it = listed([_sized(finding) for finding in accepted]), "it" if len(accepted) == 1 else "them"
+    text, grows = f"{opening} {names}", growth(error) if error else {}
+    if not error or not grows:
         return text + "."
     judged = error.get("judged_s", 1.0)
     at, horizon = error["horizons_s"].index(judged), f"{min(judged, error.get('reach_s', judged)):.3g} s"
@@ -190,33 +170,23 @@ def growth(error: Mapping[str, Any]) -> dict[str, float]:
     return {column: math.log(max(a, 1e-300) / max(b, 1e-300)) for column, (b, a) in known.items()}
 
 
+def _texts(parameters: Mapping[str, Estimate]) -> dict[str, str]:
+    """Values with their standard deviations and units."""
+    return {n: f"{with_std(p.value, p.std)} {p.unit}".rstrip(" -") for n, p in parameters.items()}
+
+
 def _sized(finding: Finding) -> str:
     """Name of a finding with its size: the first parameter, or the range of its function."""
     name, curve = with_article(words(key_of(finding.effect))), finding.curve
-    sizes = {n: f"{with_std(p.value, p.std)} {p.unit}".rstrip(" -") for n, p in finding.parameters.items()}
+    sizes = _texts(finding.parameters)
     if phrase := finding.effect.phrase(sizes):
         return phrase
-    for symbol, estimate in finding.parameters.items():
-        return f"{name} ({symbol} = {with_std(estimate.value, estimate.std)} {estimate.unit}".rstrip(" -") + ")"
-    if curve is None:
-        return name
+    if sizes or curve is None:
+        return f"{name} ({' = '.join(next(iter(sizes.items())))})" if sizes else name
     if not finding.effect.named:
         kind, inputs = "force" if curve.unit == "N" else "torque", listed(finding.effect.inputs_named())
         name = f"a {kind} at joint {finding.effect.joint} that depends on {inputs}"
     return f"{name} ({number(float(f'{np.ptp(curve.mean):.2g}'), 2)} {curve.unit} from trough to peak)"
-
-
-def friction_change(diagnosis: Diagnosis, velocity: Float[np.ndarray, "dof node"]) -> str | None:
-    """Change of the learned friction by the added effects."""
-    if not (any(diagnosis.evidence) and diagnosis.before.rig.friction):
-        return None
-    first, second = (
-        np.asarray(friction_table(f, jnp.asarray(velocity)).torque) for f in (diagnosis.before, diagnosis.after)
-    )
-    size = np.sqrt(np.mean(second**2, axis=1))
-    share = np.sqrt(np.mean((first - second) ** 2, axis=1)) / np.maximum(size, 1e-12)
-    parts = [f"joint {j + 1} by {100 * s:.0f} %" for j, s in enumerate(share)]
-    return f"Without the effect the learned friction was bent: {', '.join(parts)} of its size."
 
 
 class SuspectReport(NamedTuple):
@@ -239,15 +209,12 @@ class SuspectReport(NamedTuple):
 def suspected(diagnosis: Diagnosis) -> list[SuspectReport]:
     """Suspects of the last round, best first."""
     out = []
-    for suspect in [entry for step in diagnosis.last for entry in step.suspects]:
-        law, confirm = words(suspect.key), catalogue[suspect.key[0]].confirm
-        text = f"{law} would remove {share_of(suspect.share, 'the squared prediction error')}"
-        by_chance = f"up to {suspect.chance:.0%}" if suspect.chance >= 0.005 else "less than 1%"
-        text += f", where chance removes {by_chance}" if math.isfinite(suspect.chance) else ""
-        place, share, chance = place_of(suspect.key), suspect.share, suspect.chance
-        out.append(
-            SuspectReport(**place, share_of_error=share, chance=chance, law=law, description=text, confirm=confirm)
-        )
+    for key, share, chance in [entry for step in diagnosis.last for entry in step.suspects]:
+        text = f"{words(key)} would remove {share_of(share, 'the squared prediction error')}"
+        by_chance = f"up to {chance:.0%}" if chance >= 0.005 else "less than 1%"
+        text += f", where chance removes {by_chance}" if math.isfinite(chance) else ""
+        more = {"law": words(key), "description": text, "confirm": catalogue[key[0]].confirm}
+        out.append(SuspectReport(**place_of(key), share_of_error=share, chance=chance, **more))
     return out
 
 
@@ -257,28 +224,19 @@ def undecided(diagnosis: Diagnosis) -> tuple[Key, ...]:
 
 
 def advice(
-    accepted: Sequence[Finding],
-    rivals: Sequence[Key] = (),
-    suspects: Sequence["SuspectReport"] = (),
+    accepted: Sequence[Finding], rivals: Sequence[Key] = (), suspects: Sequence[SuspectReport] = ()
 ) -> list[str]:
     """Sentences on the next measurement."""
     out = [f"To discriminate {words(key)} from its rivals: {catalogue[key[0]].confirm}" for key in rivals]
-    # Advice for every suspect: what three recordings of a real arm left open, eleven decided
-    record_more = "To be sure of a suspect, record as many different motions again and diagnose all together."
-    out += [record_more] if suspects else []
-    out += [
-        f"To see {with_article(suspect.law)} by itself: {suspect.confirm}" for suspect in suspects if suspect.confirm
-    ]
+    if suspects:  # what three recordings of a real arm left open, eleven decided
+        out.append("To be sure of a suspect, record as many different motions again and diagnose all together.")
+    out += [f"To see {with_article(one.law)} by itself: {one.confirm}" for one in suspects if one.confirm]
     for finding in accepted:
         if finding.effect.confirm:
             out.append(f"To be sure of the {words(key_of(finding.effect))}: {finding.effect.confirm}")
-        for key in finding.equivalent:
-            out.append(f"To discriminate it from {words(key)}: {catalogue[key[0]].confirm}")
-    if not out:
-        out.append(
-            "Longer or livelier recordings show weaker effects; drive every joint or input through its whole range."
-        )
-    return out
+        out += [f"To discriminate it from {words(key)}: {catalogue[key[0]].confirm}" for key in finding.equivalent]
+    more = "Longer or livelier recordings show weaker effects; drive every joint or input through its whole range."
+    return out or [more]
 
 
 def entry(finding: Finding) -> dict[str, Any]:

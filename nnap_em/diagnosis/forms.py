@@ -37,8 +37,8 @@ class View(NamedTuple):
     whole: bool
     """True for an angle that goes round and is known all around."""
     start: float
-    """Start and length of the known part [z]."""
     span: float
+    """Start and length of the known part [z]."""
     fine: float
     """Distance of the basis functions [z]."""
     z: Float[np.ndarray, " node"]
@@ -73,7 +73,6 @@ class Form(NamedTuple):
 
     columns: Callable[[View, Places], Columns]
     describe: Callable[[View, Place, Size], Description]
-    """Description from the view, a place and the sizes."""
     grid: Places
     free: tuple[int, ...]
     """Numbers of a place that may leave the grid."""
@@ -86,9 +85,6 @@ def forms(view: View) -> list[Form]:
     within = view.start + view.span * np.linspace(0.0, 1.0, 41)
     around = np.linspace(0, 1, 41) if view.whole else within  # with both ends: what is polished stays in its grid
     widths = np.log(np.geomspace(0.3 * view.fine, max(0.25 * view.span, view.fine), 8))
-    inner = within[4:-4]
-    zones = product(inner[::2], inner[::2])
-    zones = zones[zones[:, 1] - zones[:, 0] > 0.09 * view.span]
 
     finest = 0.5 / view.fine
     part = np.arange(1.4 / view.span, 0.96 * finest, 0.3 / view.span)
@@ -105,11 +101,9 @@ def forms(view: View) -> list[Form]:
     bump = Form(_bells, _bump, product(around, widths), (0, 1), 3)
     local = [
         Form(_lines, _line, np.zeros((1, 0)), (), 1),
-        Form(_hinges, _hinge, product(inner, [-1.0, 1.0]), (0,), 2),
         Form(_steps, _step, product(within[2:-2], widths), (0, 1), 3),
         bump,
-        Form(_zones, _zone, zones, (0, 1), 3),
-        Form(_bends, _bend, inner[:, None], (0,), 3),
+        Form(_bends, _bend, within[4:-4, None], (0,), 3),
     ]
     return [form for form in waves + ([bump] if view.whole else local) if len(form.grid)]
 
@@ -131,17 +125,6 @@ def _line(view: View, place: Place, size: Size) -> Description:
     return Description("line", {"slope": slope}, f"nearly a straight line in {view.name}, slope {slope}")
 
 
-def _hinges(view: View, place: Places) -> Columns:
-    return np.maximum(0.0, place[:, 1:] * (view.z - place[:, :1]))[..., None]
-
-
-def _hinge(view: View, place: Place, size: Size) -> Description:
-    slope, at = view.slope(place[1] * size[0]), view.at(place[0])
-    side, other = ("above", "below") if place[1] > 0 else ("below", "above")
-    words = f"a hinge in {view.name} at {at}: flat {other}, slope {slope} {side}"
-    return Description("hinge", {"place": at, f"slope_{side}": slope, f"slope_{other}": view.slope(0.0)}, words)
-
-
 def _bends(view: View, place: Places) -> Columns:
     above = np.maximum(0.0, view.z - place)
     return np.stack([view.z - place - above, above], axis=2)
@@ -151,17 +134,6 @@ def _bend(view: View, place: Place, size: Size) -> Description:
     below, above, at = view.slope(size[0]), view.slope(size[1]), view.at(place[0])
     words = f"a bend in {view.name} at {at}: slope {below} below, {above} above"
     return Description("bend", {"place": at, "slope_below": below, "slope_above": above}, words)
-
-
-def _zones(view: View, place: Places) -> Columns:
-    below, above = view.z - place[:, :1], view.z - place[:, 1:]
-    return (np.maximum(0.0, above) + np.minimum(0.0, below))[..., None]
-
-
-def _zone(view: View, place: Place, size: Size) -> Description:
-    slope, low, high = view.slope(size[0]), view.at(place[0]), view.at(place[1])
-    words = f"flat in {view.name} from {low:.3g} to {high}, slope {slope} outside"
-    return Description("dead zone", {"from": low, "to": high, "slope": slope}, words)
 
 
 def _steps(view: View, place: Places) -> Columns:
@@ -225,8 +197,7 @@ def _ripple(view: View, place: Place, size: Size) -> Description:
     phase = np.arctan2(cos, sin) - 2 * np.pi * wave * view.low / view.length
     turned = Quantity(float((phase + np.pi) % (2 * np.pi) - np.pi), "rad")
     amplitude, least = view.force(np.hypot(cos, sin)), "at least " if wave > 0.4 / view.fine else ""
-    unseen = ", overtones not seen" if 3 * wave > 0.48 / view.fine else ""
-    words = f"a ripple in {view.name} of {_of(view, text)}, amplitude {least}{amplitude}{unseen}"
+    words = f"a ripple in {view.name} of {_of(view, text)}, amplitude {least}{amplitude}"
     return Description("ripple", {key: rate, "amplitude": amplitude, "phase": turned}, words)
 
 
@@ -245,12 +216,9 @@ def _square_wave(view: View, place: Place, size: Size) -> Description:
     if not view.whole:
         rises += np.ceil((view.start - rises) * wave) / wave
     up, down = view.at(rises), view.at(rises + duty / wave)
-    words = (
-        f"a square wave in {view.name} of {_of(view, text)}, {amplitude} to either side, high for {100 * duty:.0f} %"
-    )
-    words += " of the period"
+    high = f"{amplitude} to either side, high for {100 * duty:.0f} % of the period"
+    words = f"a square wave in {view.name} of {_of(view, text)}, {high}"
     if view.whole and wave == 1.0:
         words = f"a step up at {view.name} = {up:.3g} and down again at {down}, {view.force(abs(size[0]))} high"
-    return Description(
-        "square wave", {key: rate, "amplitude": amplitude, "duty": Quantity(duty, ""), "rises_at": up}, words
-    )
+    numbers = {key: rate, "amplitude": amplitude, "duty": Quantity(duty, ""), "rises_at": up}
+    return Description("square wave", numbers, words)

@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 from ..effects import AbstractEffect, Candidate, fields, flat
 from ..em.mstep import ScoringMStep
 from ..em.prior import ParameterPrior
+from ..fit.identify import Identified
 from ..model.state_space import StateSpaceModel, with_effects
 from .keys import Key
 
@@ -36,12 +37,10 @@ class Evidence(NamedTuple):
 
 
 class Addition(NamedTuple):
-    """An effect in the model."""
+    """An effect in the model, with the prior of its parameters."""
 
     effect: AbstractEffect
-    """The law as it stands."""
     mean: Float[Array, " param"]
-    """Prior of its parameters."""
     std: Float[Array, " param"]
     evidence: Evidence | None = None
 
@@ -92,6 +91,11 @@ class Hypothesis(NamedTuple):
     def refitted(self, model: StateSpaceModel) -> "Hypothesis":
         """The same with other numbers in the model."""
         return self._replace(model=model)
+
+
+def declared(fitted: Identified) -> Hypothesis:
+    """A fit, of whose laws a search keeps all."""
+    return Hypothesis(fitted.model, fitted.m_step, (None,) * len(fitted.model.effects))
 
 
 def blocks(model: StateSpaceModel, of: Any) -> list[slice]:

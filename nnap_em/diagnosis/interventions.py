@@ -44,9 +44,8 @@ class Intervention(NamedTuple):
     joint: int
     """Counted from 1."""
     first: int
-    """First row."""
     last: int
-    """Last row."""
+    """First and last row."""
     from_s: float
     to_s: float
     """End on the clock of the log [s]."""
@@ -55,15 +54,6 @@ class Intervention(NamedTuple):
     std: float
     """Standard deviation of such means without disturbances [N m, or N]."""
     unit: str
-
-
-class WindowMean(NamedTuple):
-    """Means of the missing force over Hann windows of one length."""
-
-    mean: Float[np.ndarray, "seq time dof"]
-    """NaN where a window does not fit inside its recording."""
-    std: Float[np.ndarray, "seq time dof"]
-    """Standard deviation of the mean without disturbances."""
 
 
 def averaged(a: Float[np.ndarray, "seq time column"], rows: int) -> Float[np.ndarray, "seq time column"]:
@@ -89,8 +79,12 @@ def level(a: Float[np.ndarray, "seq window"]) -> Float[np.ndarray, "seq 1"]:
     return np.maximum(np.nanquantile(size, 0.8) / 1.2816, np.asarray(single))[:, None] + 1e-300
 
 
-def window_mean(force: Float[np.ndarray, "seq time dof"], rows: int) -> WindowMean:
-    """Means over `rows` rows; their standard deviation is larger where the force scatters, as where gears chatter."""
+def window_mean(
+    force: Float[np.ndarray, "seq time dof"], rows: int
+) -> tuple[Float[np.ndarray, "seq time dof"], Float[np.ndarray, "seq time dof"]]:
+    """Means over `rows` rows, NaN where a window does not fit inside its recording, and their standard deviation
+    without disturbances, which is larger where the force scatters, as where gears chatter.
+    """
     mean = averaged(force, rows)
     scatter = np.sqrt(np.maximum(averaged(force**2, rows) - mean**2, 0.0)) + 1e-300
     std = np.full(mean.shape, np.nan)
@@ -99,7 +93,7 @@ def window_mean(force: Float[np.ndarray, "seq time dof"], rows: int) -> WindowMe
         if np.isfinite(m).any():
             large = s >= np.nanquantile(s, 0.9)
             std[..., j] = np.maximum(level(m), 1.4826 * np.nanmedian(np.abs(m[large]) / s[large]) * s)
-    return WindowMean(mean, std)
+    return mean, std
 
 
 class Places(NamedTuple):
@@ -111,10 +105,6 @@ class Places(NamedTuple):
     """All that a law may depend on, in units in which a distance of `NEIGHBOUR_DISTANCE` is small."""
     subspaces: tuple[Float[np.ndarray, "place feature"], ...]
     """All that a law of one joint may depend on: its angle and rate; the input and rate."""
-
-    def away(self, at: int, separation: int) -> Bool[np.ndarray, " place"]:
-        """True for places of another moment than `at`."""
-        return (self.seq != self.seq[at]) | (np.abs(self.row - self.row[at]) >= separation)
 
 
 def places(residual: Residual, names: Names, dt: float) -> Places:
@@ -161,8 +151,8 @@ def neighbours(
 
 def repeated(mean: Float[np.ndarray, " place"], samples: Places, at: int, separation: int) -> float:
     """The largest share of a force that acts wherever the signals of one joint are the same."""
-    away = samples.away(at, separation) & np.isfinite(mean)
-    shares = [0.0]
+    seq, row, shares = samples.seq, samples.row, [0.0]
+    away = ((seq != seq[at]) | (np.abs(row - row[at]) >= separation)) & np.isfinite(mean)
     for subspace in samples.subspaces:
         distance = np.where(away, np.linalg.norm(subspace - subspace[at], axis=1), np.inf)
         order = np.argsort(distance)[:OTHERS]
@@ -192,35 +182,30 @@ def disturbances(
     windows = [window_mean(force, rows) for rows in lengths]
     out: list[Intervention] = []
     for j in range(force.shape[-1]):
-        means = [b.mean[samples.seq, samples.row, j] for b in windows]
-        stds = [b.std[samples.seq, samples.row, j] for b in windows]
+        means, stds = ([b[i][samples.seq, samples.row, j] for b in windows] for i in (0, 1))
         sure = np.stack([_sure(m, s, samples, place, counts) for m, s in zip(means, stds, strict=True)])
         sure = np.where(np.abs(np.stack(means)) >= least[j], sure, 0.0) / np.where(counts.any(axis=1), 1.0, ALONE)
         while sure.max() >= LEVEL:
             k, at = np.unravel_index(sure.argmax(), sure.shape)
             i, row, size, std = int(samples.seq[at]), int(samples.row[at]), float(means[k][at]), float(stds[k][at])
-            first, last = _extent(windows[0].mean[i, :, j], row, math.copysign(1.0, size))
+            first, last = _extent(windows[0][0][i, :, j], row, math.copysign(1.0, size))
             beside = np.maximum(min(first, row) - samples.row, samples.row - max(last, row))
             reach = np.asarray(lengths)[:, None] // 2  # of a window: those beside it average the same push
             sure = np.where((samples.seq == i) & (beside[None] <= reach), 0.0, sure)
             clock = float(residual.t[i, first]), float(residual.t[i, last])
             disturbance = Intervention(i, j + 1, first, last, *clock, size, std, names.force_unit(j + 1))
-            again = any(_overlap(disturbance, other) for other in out)
+            again = any(_away(disturbance, other) <= 0 for other in out)
             if not again and repeated(means[k], samples, int(at), separation) < REPEATED:
                 out.append(disturbance)
-    return tuple(sorted((t for t in out if not any(_again(t, other, separation) for other in out)), key=_in_order))
+    # two pushes on a joint that are near each other are a swing of the machine
+    alone = (a for a in out if not any(a is not b and _away(a, b) < separation for b in out))
+    return tuple(sorted(alone, key=lambda a: (a.sequence, a.first, a.joint)))
 
 
-def _again(disturbance: Intervention, other: Intervention, separation: int) -> bool:
-    """True if another push on the same joint is so near that both are a swing of the machine."""
-    if (disturbance.sequence, disturbance.joint) != (other.sequence, other.joint) or disturbance is other:
-        return False
-    return max(disturbance.first - other.last, other.first - disturbance.last) < separation
-
-
-def _in_order(disturbance: Intervention) -> tuple[int, int, int]:
-    """Key of a sort by recording, then time, then joint."""
-    return disturbance.sequence, disturbance.first, disturbance.joint
+def _away(a: Intervention, b: Intervention) -> float:
+    """Rows between two disturbances of one joint in one recording; not positive where they share a row."""
+    same = (a.sequence, a.joint) == (b.sequence, b.joint)
+    return max(a.first - b.last, b.first - a.last) if same else math.inf
 
 
 def _sure(mean, std, samples: Places, place, counts) -> Float[np.ndarray, " place"]:
@@ -252,8 +237,3 @@ def interventions(fitted: Identified, data: Dataset) -> tuple[Intervention, ...]
         return ()
     least = SMALL * measure_scales(rig, system, data).torque
     return disturbances(residual(fitted, data), names_of(fitted), rig.dt, least)
-
-
-def _overlap(a: Intervention, b: Intervention) -> bool:
-    """True if two disturbances of one joint share a row."""
-    return (a.sequence, a.joint) == (b.sequence, b.joint) and a.first <= b.last and b.first <= a.last

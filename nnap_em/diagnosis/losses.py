@@ -6,7 +6,7 @@ columns, too.
 """
 
 from collections.abc import Iterator
-from typing import ClassVar, NamedTuple, cast
+from typing import Any, ClassVar, NamedTuple, cast
 
 import equinox as eqx
 import jax
@@ -15,21 +15,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ..data.dataset import whole_step
-from ..em.multistep import (
-    HORIZONS,
-    JUDGED,
-    SHORT_HORIZONS,
-    Followed,
-    at_once,
-    errors,
-    finish,
-    followed,
-    open_loop,
-    ratio,
-    starts,
-    weighed,
-)
-from ..model.state_space import StateSpaceModel
+from ..em import multistep
+from ..em.multistep import HORIZONS, JUDGED, SHORT_HORIZONS
 from ..numerics.gaussian import Gaussian
 from .columns import Blocks, candidate_columns, tracks
 from .hypothesis import Hypothesis
@@ -77,39 +64,35 @@ class MultiStep(eqx.Module):
         """
         model, path, data = fit.model, fit.path, fit.data
         weights = fit.m_step.weights(model)
+        machine = eqx.tree_at(lambda m: m.unknown, fit.declared.model, model.unknown)  # on which candidates act
         every = tuple(sorted(set(sum(self.bands, ()))))
         bands = [[every.index(h) for h in band] for band in self.bands]
-        follows, rows = followed(model, weights.prior, path, data), starts(model, data, every)
+        follows, rows = multistep.followed(model, weights.prior, path, data), multistep.starts(model, data, every)
         track = jax.tree.map(np.asarray, tracks(model, path, follows.linear.seq.inputs))
-        error, own = errors(follows, every), weights.nodes.size + weights.prior.size
+        error, own = multistep.errors(follows, every), weights.nodes.size + weights.prior.size
         size = whole_step(max(sum(len(one.probes) for one in block) for block in blocks))  # columns of 0 fill them up
         full = whole_step(fit.rows)
-        share = at_once(model, own + size, full)
+        share = multistep.at_once(model, own + size, full)
         for block in blocks:
-            along = candidate_columns(_machine(fit), block, size, full)
+            along = candidate_columns(machine, block, size, full)
             extra = lambda s: along(jax.tree.map(lambda a: a[s], track))  # noqa: B023, E731
-            predictions = open_loop(follows, weights, extra, every, error, share=share)
-            weight = weighed(predictions._replace(columns=predictions.columns[..., :own]), fit.used)
-            yield tuple(
-                Linearised(
-                    _flat(error[:, :, band]),
-                    _flat(predictions.columns[:, :, band], 1),
-                    _flat(weight[:, :, band]),
-                    float(np.mean(predictions.overlap[band])),
-                    rows,
-                )
-                for band in bands
-            )
+            predictions = multistep.open_loop(follows, weights, extra, every, error, share=share)
+            weight = multistep.weighed(predictions._replace(columns=predictions.columns[..., :own]), fit.used)
+            out = []
+            for band in bands:
+                e, columns, w = (_flat(a[:, :, band]) for a in (error, predictions.columns, weight))
+                out.append(Linearised(e, columns, w, float(np.mean(predictions.overlap[band])), rows))
+            yield tuple(out)
 
     def finish(self, fit: SmoothedFit, trial: Refit) -> Refit:
         """A `trial` after Gauss-Newton steps on the multi-step errors, which follow its fit by likelihood."""
-        along = finish(trial.model, trial.m_step, trial.path, fit.data, fit.used)
+        along = multistep.finish(trial.model, trial.m_step, trial.path, fit.data, fit.used)
         return trial._replace(model=along.model, along=along)
 
     def along(self, fit: SmoothedFit, hypothesis: Hypothesis, path: Gaussian) -> Refit:
         """`hypothesis` as it is, along a path of the sequences of `fit`."""
         model, rule = hypothesis.model, hypothesis.m_step
-        errors_from = followed(model, rule.prior, path, fit.data)
+        errors_from = multistep.followed(model, rule.prior, path, fit.data)
         return Refit(model, rule, path, np.zeros(0), jnp.zeros((0, 0)), errors_from)
 
     def ratio(self, null: Refit, full: Refit, fit: SmoothedFit, band: int, see: tuple[int, ...] = ()) -> float:
@@ -117,15 +100,10 @@ class MultiStep(eqx.Module):
 
         Squares are robust, each fit along its own smoothed paths; of the readings `see`, or those that are compared.
         """
-        before, after = (errors(cast(Followed, t.along), self.judged[band], see) for t in (null, full))
-        return ratio(before, after, fit.used)
+        before, after = (multistep.errors(cast(Any, t.along), self.judged[band], see) for t in (null, full))
+        return multistep.ratio(before, after, fit.used)
 
 
-def _machine(fit: SmoothedFit) -> StateSpaceModel:
-    """The declared machine with the friction of the fit, on which candidates act."""
-    return eqx.tree_at(lambda m: m.unknown, fit.declared.model, fit.model.unknown)
-
-
-def _flat(a: np.ndarray, last: int = 0) -> np.ndarray:
+def _flat(a: np.ndarray) -> np.ndarray:
     """Horizons and channels as one axis."""
-    return a.reshape(*a.shape[:2], a.shape[2] * a.shape[3], *a.shape[4 : 4 + last])
+    return a.reshape(*a.shape[:2], a.shape[2] * a.shape[3], *a.shape[4:])

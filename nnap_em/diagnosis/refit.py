@@ -59,7 +59,7 @@ def refit(
     data: Dataset,
     used: Bool[np.ndarray, " seq"],
     *,
-    passes: int = 5,
+    passes: int = 8,
 ) -> Refit:
     """`model` after `passes` passes from `path`, fitted to the sequences `used`; the likelihood is of all of them.
 

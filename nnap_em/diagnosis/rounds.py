@@ -22,6 +22,8 @@ from .trial import Trial, explained, null_of, with_candidate
 from .verdict import EQUIVALENT, NAMED, even, odds, simplest, suspected
 
 _Law = TypeVar("_Law", Screened, Trial)
+SHORTLIST = 8
+"""Candidates that are refitted at most."""
 
 
 class Round(NamedTuple):
@@ -41,11 +43,10 @@ def screening_round(fit: SmoothedFit, context: SearchContext) -> Round:
     seen = screen(context.loss, fit, proposals(around, fit.model.effects))
     fresh = [s for s in seen if s.candidate.start.visible(around) and _fresh(s.candidate.start, fit)]
     length = int(np.max(np.sum(np.asarray(fit.data.valid), axis=1)))
-    fitting = fit, context.loss, context.effort.passes
-    null = functools.cache(lambda: null_of(fit.hypothesis, *fitting))
+    null = functools.cache(lambda: null_of(fit.hypothesis, fit, context.loss))
 
     def refitted(forms: Sequence[Screened]) -> Trial:
-        case = with_candidate(forms, null(), *fitting)
+        case = with_candidate(forms, null(), fit, context.loss)
         case = case if case.rejection else case._replace(before=explained(case, context))
         _log(case, context)
         return case
@@ -62,12 +63,12 @@ def decided(
 ) -> Round:
     """The best laws of a screen, `refitted` from their starts that explain as much, until one is accepted."""
     ranked = best_of_kind(s for s in fresh if seeded(s.candidate, s.coefficients).is_physical())
-    step = step._replace(screened=tuple((key_of(s.candidate.start), _listed(s)) for s in ranked))
+    step = step._replace(screened=tuple((key_of(s.candidate.start), s.listed) for s in ranked))
     admitted = [s for s in ranked if s.reached]
     tried: list[Trial] = []
     complete = True
     try:
-        while admitted and (left := context.effort.shortlist - len(_removals(tried))) > 0:
+        while admitted and (left := SHORTLIST - len(_removals(tried))) > 0:
             group = _group(admitted, model)[:left]
             cases = [refitted(_forms(s, fresh)) for s in group]
             tried += cases
@@ -78,8 +79,8 @@ def decided(
     except TimeUp:
         complete = False
     judged = {key_of(case.candidate.start) for case in tried}
-    others = [s for s in ranked if key_of(s.candidate.start) not in judged]
-    step = step._replace(refitted=_removals(tried), suspects=_suspects(others), untried=len(admitted))
+    suspects = _suspects([s for s in ranked if key_of(s.candidate.start) not in judged])
+    step = step._replace(refitted=_removals(tried), suspects=suspects, untried=len(admitted))
     return Round(step, None, complete=complete)
 
 
@@ -140,9 +141,8 @@ def _form(law: _Law, laws: Sequence[_Law], values: Sequence[float], model: State
     """
     own = law.candidate.start
     one_cause = lambda other: contains(other, own, model.system) or contains(own, other, model.system)  # noqa: E731
-    places = [i for i, other in enumerate(laws) if other is law or one_cause(other.candidate.start)]
-    some = [laws[i] for i in places]
-    explained = [values[i] for i in places]
+    pairs = [(a, b) for a, b in zip(laws, values, strict=True) if a is law or one_cause(a.candidate.start)]
+    some, explained = [a for a, _ in pairs], [value for _, value in pairs]
     return some[simplest(explained, _complexities(some, model), explained)]
 
 
@@ -153,14 +153,9 @@ def other_cause(one: AbstractEffect, best: AbstractEffect, system: AbstractSyste
     return not same_law and bool(of_best and of_one) and of_best.isdisjoint(of_one)
 
 
-def _listed(screened: Screened) -> float:
-    """Share as a report lists it; 0 where the parts disagree."""
-    return screened.share.least if screened.admissible else 0.0
-
-
 def _fresh(law: AbstractEffect, fit: SmoothedFit) -> bool:
-    """True for a law that the model does not hold, or that takes the place of one; for a change of one of the fit from
-    which the search began, too, in the form that it has there.
+    """True for a law that the model does not hold, or that takes the place of one; of laws of an earlier fit also for
+    a change of one, in the form that it has there.
     """
     model, pairs = fit.model, list(zip(fit.model.effects, fit.hypothesis.evidence, strict=True))
     present = {key_of(effect) for effect, evidence in pairs if evidence is not None}
@@ -176,7 +171,7 @@ def best_of_kind(every: Iterable[Screened]) -> list[Screened]:
         key = key_of(screened.candidate.start)
         if key not in best or best[key].rank < screened.rank:
             best[key] = screened
-    return sorted(best.values(), key=_listed, reverse=True)
+    return sorted(best.values(), key=lambda s: s.listed, reverse=True)
 
 
 def _forms(law: Screened, every: Sequence[Screened]) -> list[Screened]:
@@ -188,20 +183,16 @@ def _forms(law: Screened, every: Sequence[Screened]) -> list[Screened]:
 
 
 def _log(case: Trial, context: SearchContext) -> None:
-    """One line on a refit."""
     values = {n: float(f"{float(v):.4g}") for n, v in case.effect.values().items()}
-    share, reason, error = case.screened.share.least, case.rejection, "the squared error"
+    removed = (case.screened.share.least, case.foreseen, case.removed)
+    screened, step, after = (share_of(share, "the squared error", 1) for share in removed)
     name, bar = words(key_of(case.effect)), f"bar {case.screened.bar:.1%}"
-    step = f"{share_of(case.foreseen, error, 1)} along its step"
-    if case.refit is None:
-        context.log(f"  {name} {values}: {share_of(share, error, 1)} by the linear screen, {step}; {bar}; not refitted")
-        return
+    text = f"{name} {values}: {screened} by the linear screen, {step} along its step"
     context.log(
-        f"  refitted {name} {values}: {share_of(share, error, 1)} by the linear screen, {step}, "
-        f"{share_of(case.removed, error, 1)} after it; {bar}"
+        f"  {text}; {bar}; not refitted" if case.refit is None else f"  refitted {text}, {after} after it; {bar}"
     )
-    if reason is not None:
-        context.log(f"  {words(key_of(case.effect))} {reason.sentence}")
+    if case.refit is not None and (reason := case.rejection):
+        context.log(f"  {name} {reason.sentence}")
 
 
 def _removals(tried: Sequence[Trial]) -> tuple[tuple[Key, float], ...]:
@@ -214,8 +205,8 @@ def _suspects(ranked: Sequence[Screened]) -> tuple[Suspect, ...]:
     """Laws that remove more than chance in a round after which none was accepted: those near the best, and of these the
     named ones first.
     """
-    near = [s for s in ranked if _listed(s) >= NAMED * max(map(_listed, ranked))]
+    near = [s for s in ranked if s.listed >= NAMED * max(s.listed for s in ranked)]
     near.sort(key=lambda s: not s.candidate.start.named)
-    over = [s for s in near if suspected(_listed(s), s.floor, s.chance)]
-    listed = 4  # the right law was the fourth on a real arm with three recordings
-    return tuple(Suspect(key_of(s.candidate.start), s.share.least, s.chance) for s in over[:listed])
+    over = [s for s in near if suspected(s.listed, s.floor, s.chance)]
+    # four, as the right law was the fourth on a real arm with three recordings
+    return tuple(Suspect(key_of(s.candidate.start), s.share.least, s.chance) for s in over[:4])

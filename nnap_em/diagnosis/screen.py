@@ -14,18 +14,23 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.linalg import cho_factor, cho_solve
 
+from ..data.dataset import Dataset
 from ..effects import Candidate, fields
 from ..em.shape import friction_prior
+from ..model.state_space import StateSpaceModel
+from ..numerics.gaussian import Gaussian
 from ..storage.journal import HERE, step
 from .columns import blocks_of
-from .folds import parts
 from .keys import complexity
 from .losses import Linearised, MultiStep
 from .smoothed import SmoothedFit
-from .verdict import CHANCE, MULTI_STEP, Share, agreed, required, sensible
+from .verdict import CHANCE, MULTI_STEP, REPEATS, Share, agreed, required, sensible
 
 SHIFTS = 2
 """Placebos whose largest share is the chance level."""
+MOTION_PARTS, QUARTERS, MOMENT_PARTS = 5, 4, 5
+"""Parts that are left out in turn: motions, as far as there are recordings, repetitions together; parts of each motion,
+where there are fewer than three; moments of all recordings: what happens at one moment of every recording is no law."""
 
 
 class Rows(NamedTuple):
@@ -96,9 +101,65 @@ class Screened(NamedTuple):
         return self.sound and agreed(self.share.folds, self.floor, responds=self.candidate.start.responds_to_feedback())
 
     @property
+    def listed(self) -> float:
+        """Share as a report lists it; 0 where the parts disagree."""
+        return self.share.least if self.admissible else 0.0
+
+    @property
     def sound(self) -> bool:
         """True for strengths that a fit may reach and that friction and parameters cannot stand for."""
         return sensible(float(self.coefficients[0]), self.far, self.survived, linear=self.candidate.start.linear)
+
+
+def motions(state: Float[np.ndarray, "seq time state"], used: Bool[np.ndarray, " seq"]) -> Int[np.ndarray, " seq"]:
+    """Number of the motion of every sequence; those that repeat a motion are no evidence of each other and share it."""
+    size = np.nanmean(state[used] ** 2, axis=(0, 1)) + 1e-12
+    scaled = state / np.sqrt(size)
+    motion = np.arange(len(state))
+    for i, j in itertools.combinations(np.flatnonzero(used), 2):
+        known = np.isfinite(scaled[[i, j]]).all(axis=-1)
+        both = known.all(axis=0)
+        if 2 * both.sum() < known.sum(axis=1).max():  # too short a part of the longer one to be its repetition
+            continue
+        difference, square = np.mean((scaled[i] - scaled[j])[both] ** 2), np.mean(scaled[[i, j]][:, both] ** 2)
+        if difference < REPEATS * square:
+            motion[motion == motion[j]] = motion[i]
+    return motion
+
+
+def times(clock: Float[np.ndarray, "seq time"], data: Dataset, count: int) -> Int[np.ndarray, "seq time"]:
+    """Part, of `count` equal ones, of its sequence that each moment of `clock` [s] lies in."""
+    t = np.where(np.asarray(data.valid), np.asarray(data.t), np.nan)
+    low, high = (of(t, axis=1, keepdims=True) for of in (np.nanmin, np.nanmax))
+    return np.clip((count * (clock - low) / (high - low + 1e-12)).astype(int), 0, count - 1)
+
+
+def fold_of(
+    used: Bool[np.ndarray, " seq"], motion: Int[np.ndarray, " seq"], quarter: Int[np.ndarray, "seq time"]
+) -> Int[np.ndarray, "seq time"]:
+    """Part of every moment: neighbouring motions together, or quarters of the only ones."""
+    different, first = np.unique(motion[used], return_index=True)
+    order = np.zeros(used.size, int)
+    for rank, i in enumerate(np.argsort(first)):
+        order[motion == different[i]] = rank
+    count = different.size
+    if count >= 3:
+        return np.repeat((order * min(MOTION_PARTS, count) // count)[:, None], quarter.shape[1], axis=1)
+    return order[:, None] * QUARTERS + quarter
+
+
+def parts(
+    model: StateSpaceModel,
+    path: Gaussian,
+    data: Dataset,
+    used: Bool[np.ndarray, " seq"],
+    rows: Int[np.ndarray, " time"],
+) -> tuple[Int[np.ndarray, "seq time"], Int[np.ndarray, "seq time"]]:
+    """Fold and block of the moments at `rows` of every sequence."""
+    state = np.where(np.asarray(data.valid)[..., None], np.asarray(path.mean), np.nan)
+    motion = motions(state[..., : 2 * len(model.system.coordinates)], used)
+    clock = np.asarray(data.t)[:, rows]
+    return fold_of(used, motion, times(clock, data, QUARTERS)), times(clock, data, MOMENT_PARTS)
 
 
 def spans(candidates: Sequence[Candidate]) -> list[slice]:
@@ -232,10 +293,7 @@ def _ridge(candidate: Candidate) -> Float[np.ndarray, " probe"]:
     return np.array([np.sum(((probe - start) / spread) ** 2) for probe in probes])
 
 
-_SHARES = Shares(HERE, HERE, HERE, HERE, HERE, HERE)
-
-
-@step(lambda loss, _, __, shifts: ((_SHARES,) * (1 + shifts),) * len(loss.bands))
+@step(lambda loss, _, __, shifts: ((Shares(*6 * [HERE]),) * (1 + shifts),) * len(loss.bands))
 def _bands(
     loss: MultiStep, fit: SmoothedFit, candidates: Sequence[Candidate], shifts: int
 ) -> tuple[tuple[Shares, ...], ...]:
@@ -247,11 +305,10 @@ def _bands(
     prior = friction_prior(fit.model, fit.m_step.weights(fit.model))
     for some, bands in zip(blocks, loss.linearise(fit, blocks), strict=True):
         out.append([_band(fit, some, *prior, linearised, shifts) for linearised in bands])
-    return tuple(map(_joined, zip(*out, strict=True)))
+    return tuple(jax.tree.map(lambda *some: np.concatenate(some), *band) for band in zip(*out, strict=True))
 
 
 def _band(fit: SmoothedFit, candidates, precision, pull, linearised: Linearised, shifts: int) -> tuple[Shares, ...]:
-    """The screen of some candidates at one band."""
     count, timed = 1 + shifts, ["time" in c.start.signals(fit.model.system) for c in candidates]
     fold, block = parts(fit.model, fit.path, fit.data, fit.used, linearised.rows)
     rng, size = np.random.default_rng(0), spans(candidates)[-1].stop
@@ -263,11 +320,6 @@ def _band(fit: SmoothedFit, candidates, precision, pull, linearised: Linearised,
     return tuple(Shares(*some) for some in zip(*(np.split(a, count) for a in every), strict=True))
 
 
-def _joined(blocks: Sequence[tuple[Shares, ...]]) -> tuple[Shares, ...]:
-    """The screen of all candidates at one band."""
-    return jax.tree.map(lambda *arrays: np.concatenate(arrays), *blocks)
-
-
 def screen(
     loss: MultiStep, fit: SmoothedFit, candidates: Sequence[Candidate], shifts: int = SHIFTS
 ) -> tuple[Screened, ...]:
@@ -275,12 +327,10 @@ def screen(
 
     Bands are in the order of what they prove: errors soon after a start show more of what else a model lacks.
     """
-    bands = _bands(loss, fit, candidates, shifts)
-    out = []
-    for number, band in enumerate(bands):
-        (real, *moved), floor = band, MULTI_STEP / loss.remaining_share(fit)
-        placebo = [s for one in moved for s in _screened(one, candidates, number, floor, 0.0)]
-        chance = max([0.0, *(s.share.least for s in placebo if s.admissible)])
+    out, floor = [], MULTI_STEP / loss.remaining_share(fit)
+    for number, (real, *moved) in enumerate(_bands(loss, fit, candidates, shifts)):
+        placebos = [s for one in moved for s in _screened(one, candidates, number, floor, 0.0)]
+        chance = max([0.0, *(s.listed for s in placebos)])
         out.append(_screened(real, candidates, number, floor, chance))
     return tuple(max(same, key=lambda s: s.rank) for same in zip(*out, strict=True))
 

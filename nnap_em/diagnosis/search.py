@@ -5,7 +5,7 @@ import math
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple, cast
+from typing import Any, cast
 
 import equinox as eqx
 import jax
@@ -29,7 +29,7 @@ from ..smoother.start import StartBank
 from ..storage.deadline import TimeUp, until
 from ..storage.log import Log, silent
 from .backward import backward
-from .context import SEARCH_EFFORT, SHORT, Effort, SearchContext, Stages, extend, smooth
+from .context import SHORT, SearchContext, Stages, extend, smooth
 from .equations import search_equations
 from .hypothesis import Evidence, Hypothesis, covariances
 from .interventions import Intervention, interventions
@@ -37,13 +37,15 @@ from .keys import Key, key_of, remainder_of, replaced, words
 from .losses import MultiStep
 from .outcome import Diagnosis, Step, Suspect
 from .quantised import quantised
-from .rounds import Round, screening_round
+from .rounds import screening_round
 from .smoothed import along, risen_since
 from .trial import Trial, certainty
 from .verdict import DETERMINED, FOLLOWED, HELD, Rejection, even
 
 FAILURES = (ArithmeticError, ValueError, RuntimeError)
 """Numerical failures: those of NumPy and SciPy are ValueErrors, those of JAX and `FitError` RuntimeErrors."""
+MOST_LAWS = 4
+"""Laws that a search adds at most."""
 
 
 def _forward(context: SearchContext, hypothesis: Hypothesis, length: int, steps: list[Step]) -> Hypothesis:
@@ -54,15 +56,18 @@ def _forward(context: SearchContext, hypothesis: Hypothesis, length: int, steps:
     context.log(f"{context.loss.measure}, horizon {reach}: {followed.sum()} of {followed.size} sequences followed")
     effects = zip(hypothesis.model.effects, hypothesis.evidence, strict=True)
     added = sum(not effect.read_off and evidence is not None for effect, evidence in effects)
-    if not fit.used.any() or added >= context.effort.most:
+    if not fit.used.any() or added >= MOST_LAWS:
         return hypothesis
     outcome = screening_round(fit, context)
     steps.append(outcome.step)
     if not outcome.complete:
         raise TimeUp
-    if outcome.accepted is None:
+    if (case := outcome.accepted) is None:
         return hypothesis
-    return joined(hypothesis, outcome.accepted, _evidence(outcome), context)
+    screened, share = case.screened, case.screened.share
+    parts = sum(part > 0 for part in share.folds), len(share.folds)
+    found = {"share": share.left_out, "chance": screened.chance, "parts": parts, "removed": case.removed}
+    return joined(hypothesis, case, Evidence(equivalent=outcome.equivalent, candidate=case.candidate, **found), context)
 
 
 def joined(hypothesis: Hypothesis, case: Trial, evidence: Evidence, context: SearchContext) -> Hypothesis:
@@ -87,15 +92,6 @@ def _names(hypothesis: Hypothesis) -> frozenset[tuple[tuple[Key, Any], int]]:
     return frozenset(Counter((key_of(e), jax.tree.structure(e)) for e in hypothesis.model.effects).items())
 
 
-def _evidence(outcome: Round) -> Evidence:
-    """Evidence for an accepted law, with its equivalents."""
-    case = cast(Trial, outcome.accepted)
-    screened, share = case.screened, case.screened.share
-    parts = sum(part > 0 for part in share.folds), len(share.folds)
-    found = {"share": share.left_out, "chance": screened.chance, "parts": parts, "removed": case.removed}
-    return Evidence(equivalent=outcome.equivalent, candidate=case.candidate, **found)
-
-
 def search(context: SearchContext, *, release: Callable[[Identified, Dataset], Identified]) -> Diagnosis:
     """Search for what the declared model lacks, by multi-step errors; `release` ends the fit of the outcome."""
     before = context.before
@@ -104,14 +100,16 @@ def search(context: SearchContext, *, release: Callable[[Identified, Dataset], I
     except FAILURES as error:
         context.log(f"  with steps of readings as noise the fit fails ({error})")
         begun = context.declared, None
-    hypothesis, state, steps, complete, failure = _search(context, *begun, lengths_of(context))
-    outcome = _outcome(before, hypothesis, state)
+    steps: list[Step] = []
+    hypothesis, state, stopped = _search(context, *begun, lengths_of(context), steps)
+    outcome = before if state is None else before._replace(state=state, m_step=hypothesis.m_step)
     try:
         hypothesis, outcome, steps = _determined(context, hypothesis, state, steps, release)
     except FAILURES as error:
-        complete, failure = False, failure or _told(context, error)
+        stopped = stopped or _told(context, error)
     found = cast(tuple[Evidence, ...], hypothesis.evidence)
-    return Diagnosis(before, outcome or before, found, tuple(steps), complete=complete, failure=failure)
+    done = {"complete": stopped is None, "failure": stopped or ""}
+    return Diagnosis(before, outcome or before, found, tuple(steps), **done)
 
 
 def _determined(
@@ -123,7 +121,7 @@ def _determined(
 ) -> tuple[Hypothesis, Identified | None, list[Step]]:
     """The outcome without laws that are not determined as they are stated, the least sure first: those are suspects."""
     while state is not None and any(hypothesis.evidence):
-        outcome = release(_outcome(context.before, hypothesis, state), context.data)
+        outcome = release(context.before._replace(state=state, m_step=hypothesis.m_step), context.data)
         model, found = outcome.model, hypothesis.evidence
         spreads = covariances(model, outcome.m_step, outcome.state.hessian)
         sure = [
@@ -171,10 +169,6 @@ def lengths_of(context: SearchContext) -> list[int]:
     return [max(most, default=min(followed, default=longest))]
 
 
-def _outcome(before: Identified, hypothesis: Hypothesis, state: EMState | None) -> Identified:
-    return before if state is None else before._replace(state=state, m_step=hypothesis.m_step)
-
-
 def _told(context: SearchContext, error: Exception) -> str:
     """The first line of a failure, after a line of progress on it."""
     text = (str(error).strip().splitlines() or [type(error).__name__])[0]
@@ -182,26 +176,16 @@ def _told(context: SearchContext, error: Exception) -> str:
     return text
 
 
-class _Searched(NamedTuple):
-    """Outcome of a search."""
-
-    hypothesis: Hypothesis
-    state: EMState | None
-    """Its fit over the whole length; None for the declared model."""
-    steps: list[Step]
-    complete: bool = True
-    failure: str = ""
-    """Numerical failure that ended it."""
-
-
-def _search(context: SearchContext, hypothesis: Hypothesis, state: EMState | None, lengths: list[int]) -> _Searched:
-    """Forward selection and backward elimination, until neither changes anything or the time is up.
+def _search(
+    context: SearchContext, hypothesis: Hypothesis, state: EMState | None, lengths: list[int], steps: list[Step]
+) -> tuple[Hypothesis, EMState | None, str | None]:
+    """Forward selection and backward elimination, until neither changes anything or the time is up: the hypothesis, its
+    fit over the whole length, and the numerical failure that stopped it, empty where the time was up.
 
     The rounds use `lengths` rows in turn, then, and after the first law at once, all.  A law that was accepted
-    in time is fitted over the whole length, however long that takes.  A round that fails ends it.
+    in time is fitted over the whole length, however long that takes.
     """
     searched: set[frozenset] = set()
-    steps: list[Step] = []
     longest = context.longest
     ahead = [longest] if state else [*(length for length in lengths if length < longest), longest]
     while True:
@@ -218,20 +202,20 @@ def _search(context: SearchContext, hypothesis: Hypothesis, state: EMState | Non
                     steps[-1:] = [step._replace(accepted=None) for step in steps[-1:]]
                     proposed = backward(context, hypothesis)
                     if _names(proposed) == _names(hypothesis):
-                        return _Searched(hypothesis._replace(evidence=proposed.evidence), state, steps)
+                        return hypothesis._replace(evidence=proposed.evidence), state, None
         except TimeUp:
             context.log("the time is up: the search is not finished")
-            return _Searched(hypothesis, state, steps, complete=False)
+            return hypothesis, state, ""
         except FAILURES as error:
-            return _Searched(hypothesis, state, steps, complete=False, failure=_told(context, error))
+            return hypothesis, state, _told(context, error)
         try:
             hypothesis, state = proposed, extend(context, proposed, length) if proposed.evidence else None
         except FAILURES as error:
             context.log(f"  with the new law the fit fails ({error}); it is removed")
             steps[-1] = steps[-1]._replace(accepted=None)
-            return _Searched(hypothesis, state, steps)
+            return hypothesis, state, None
         if _names(hypothesis) in searched:
-            return _Searched(hypothesis, state, steps)
+            return hypothesis, state, None
         ahead = [longest]
 
 
@@ -240,7 +224,6 @@ def diagnose(
     data: Dataset | Logs,
     *,
     key: PRNGKeyArray,
-    effort: Effort = SEARCH_EFFORT,
     log: Log = silent,
     seconds: float = math.inf,
     start: Identified | None = None,
@@ -254,7 +237,6 @@ def diagnose(
         rig: what is declared.
         data: sequences; two at least, better five.
         key: random key of the start.
-        effort: limits of the search.
         log: receives a line of progress at a time.
         seconds: time after which no new round or refit begins [s]; the outcome is then what was accepted until that,
             not `complete`. The first fit, and that of an accepted law over the whole length, are always done.
@@ -307,7 +289,7 @@ def diagnose(
     change = start is not None
     origin = None if start is None or own is None else along(start, own, unbranched(start.bank))
     risen = None if origin is None else risen_since(origin, along(before, data, before.smoother))
-    context = SearchContext(before, stages, data, MultiStep(), effort, log, end, origin, change, white, risen)
+    context = SearchContext(before, stages, data, MultiStep(), log, end, origin, change, white, risen)
     diagnosis = search(context, release=ended)._replace(risen=risen)
     if change or not white:
         before = ended(before, data)
@@ -330,10 +312,7 @@ def _pushed(fitted: Identified, data: Dataset, log: Log) -> tuple[Intervention, 
 def _put(
     start: Identified, rig: Rig, data: Dataset, hold: float, key: PRNGKeyArray
 ) -> tuple[Identified, Bool[np.ndarray, " seq"]]:
-    """A fit on other recordings, its posterior their prior, and the sequences that it follows.
-
-    Raises FitError where it follows none.
-    """
+    """A fit on other recordings, its posterior their prior, and the sequences that it follows."""
     before = known(start, rig, data, key=key, smoother=unbranched, hold=hold)
     posterior = e_step(before.model, data, before.smoother, key=before.state.key)
     used = np.asarray(not_diverged(posterior, data))

@@ -1,6 +1,5 @@
 """Choice of the simplest shape that explains a learned curve, compared in the basis of the curve."""
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -48,10 +47,9 @@ class _Seen(NamedTuple):
     ) -> tuple[Float[np.ndarray, "place column"], Float[np.ndarray, "place direction"]]:
         """Sizes of the columns by linear least squares, and the remainder, for each of many places."""
         seen = self.project @ columns
-        gram = seen.swapaxes(1, 2) @ seen
-        eye = np.eye(gram.shape[1])
-        gram = gram + (1e-6 * np.trace(gram, axis1=1, axis2=2) + 1e-300)[:, None, None] * eye
-        size = np.linalg.solve(gram, seen.swapaxes(1, 2) @ self.target[:, None])
+        gram, way = seen.swapaxes(1, 2) @ seen, seen.swapaxes(1, 2) @ self.target[:, None]
+        ridge = (1e-6 * np.trace(gram, axis1=1, axis2=2) + 1e-300)[:, None, None] * np.eye(gram.shape[1])
+        size = np.linalg.solve(gram + ridge, way)
         return size[..., 0], self.target - (seen @ size)[..., 0]
 
 
@@ -82,8 +80,7 @@ def shape(curve: Curve) -> Shape:
     (_, price, explains, chosen), *others = [one for one in tried if one[0] < lowest + INDISTINGUISHABLE]
     rivals = tuple(dict.fromkeys(t.kind for _, p, _, t in others if t.kind != chosen.kind and p <= price))
     words = chosen.words + _looked(curve, known)
-    if rivals:
-        words += f" (a {' or '.join(rivals)} would explain it as well)"
+    words += f" (a {' or '.join(rivals)} would explain it as well)" if rivals else ""
     limits = view.low + view.length * view.start, view.low + view.length * (view.start + view.span)
     return Shape(chosen.kind, chosen.numbers, explains, view.fine * view.length, limits, rivals, words)
 
@@ -131,33 +128,23 @@ def _best(form: Form, seen: _Seen, view: View) -> tuple[np.ndarray, np.ndarray, 
         size, residual = seen.fit(form.columns(view, place[None]))
         return size[0], residual[0]
 
+    def polished(start: np.ndarray) -> np.ndarray:
+        def moved(part: np.ndarray) -> np.ndarray:
+            place = start.copy()
+            place[free] = part
+            return place
+
+        bounds = low[free], high[free]
+        return moved(least_squares(lambda part: left(moved(part))[1], start[free], bounds=bounds, max_nfev=15).x)
+
     _, residual = seen.fit(form.columns(view, form.grid))
-    rss = (residual**2).sum(axis=1)
-    free = [] if rss.min() > 0.5 * seen.target @ seen.target else list(form.free)  # far from an explanation
+    rss, low, high = (residual**2).sum(axis=1), form.grid.min(axis=0), form.grid.max(axis=0)
+    far = rss.min() > 0.5 * seen.target @ seen.target  # from an explanation
+    free = [i for i in form.free if low[i] < high[i] and not far]
     places = [form.grid[i] for i in np.argsort(rss, kind="stable")[: 2 if free else 1]]
-    low, high = form.grid.min(axis=0), form.grid.max(axis=0)
-    if free:
-        places = [_polished(lambda p: left(p)[1], place, free, low, high) for place in places]
-    fits = [(place, *left(place)) for place in places]
+    fits = [(place, *left(place)) for place in (map(polished, places) if free else places)]
     place, size, residual = min(fits, key=lambda fit: float(fit[2] @ fit[2]))
     return place, size, float(residual @ residual)
-
-
-def _polished(
-    left: Callable[[np.ndarray], np.ndarray], start: np.ndarray, free: list[int], low: np.ndarray, high: np.ndarray
-) -> np.ndarray:
-    """A place whose free entries are moved to the least remainder."""
-
-    def moved(part: np.ndarray) -> np.ndarray:
-        place = start.copy()
-        place[free] = part
-        return place
-
-    free = [i for i in free if low[i] < high[i]]
-    if not free:
-        return start
-    solution = least_squares(lambda part: left(moved(part)), start[free], bounds=(low[free], high[free]), max_nfev=15)
-    return moved(solution.x)
 
 
 def _smooth(curve: Curve, known: np.ndarray) -> Shape:

@@ -17,7 +17,7 @@ from ..numerics.gaussian import Gaussian
 from ..numerics.ode import integrate
 from ..numerics.parallel import each
 from ..smoother.posterior import AbstractSmoother
-from .hypothesis import Hypothesis
+from .hypothesis import Hypothesis, declared
 
 
 class SmoothedFit(NamedTuple):
@@ -47,11 +47,9 @@ class SmoothedFit(NamedTuple):
 
 def along(fitted: Identified, data: Dataset, smoother: AbstractSmoother) -> SmoothedFit:
     """A fit as it is along some recordings."""
-    hypothesis = Hypothesis(fitted.model, fitted.m_step, (None,) * len(fitted.model.effects))
-    posterior = e_step(fitted.model, data, smoother, key=fitted.state.key)
-    return SmoothedFit(
-        hypothesis, hypothesis, posterior.state, data, np.asarray(not_diverged(posterior, data)), data.t.shape[1]
-    )
+    hypothesis, posterior = declared(fitted), e_step(fitted.model, data, smoother, key=fitted.state.key)
+    used = np.asarray(not_diverged(posterior, data))
+    return SmoothedFit(hypothesis, hypothesis, posterior.state, data, used, data.t.shape[1])
 
 
 def risen_since(own: SmoothedFit, now: SmoothedFit) -> Risen:
@@ -66,7 +64,6 @@ def extended(model: StateSpaceModel, path: Gaussian, data: Dataset) -> Gaussian:
 
 
 def _extended(model: StateSpaceModel, one) -> Gaussian:
-    """Path of one sequence."""
     (mean, cov), seq = one
     width, states = mean.shape[-1], model.start.mean.shape[0]
     still = jnp.zeros(len(model.system.coordinates), mean.dtype)

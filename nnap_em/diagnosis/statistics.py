@@ -1,15 +1,19 @@
-"""Tests that the innovations of a right model pass: white, of variance 1, independent of all known before.
+"""Tests of the innovations of a fit, channel by channel: each with a size and a sentence for the report.
 
-Each gives its statistic, its p-value, and a size, the distance from a right model whatever the number of samples.
+Innovations of a right model are white, of variance 1, and independent of inputs, states and time.  Each test gives its
+statistic, its p-value, and a size, the distance from a right model whatever the number of samples.
 [Bar-Shalom, Li & Kirubarajan 2001, "Estimation with Applications to Tracking and Navigation", section 5.4]
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
 
 import numpy as np
 import scipy.stats
 from jaxtyping import Bool, Float
+
+from .residual import Names, Residual
 
 LAGS = 20
 """Samples over which innovations are tested for whiteness."""
@@ -22,9 +26,7 @@ def holm(p: Sequence[float]) -> Float[np.ndarray, " test"]:
     values = np.asarray(p, float)
     order = np.argsort(values)
     steps = np.maximum.accumulate((values.size - np.arange(values.size)) * values[order])
-    out = np.empty_like(values)
-    out[order] = np.minimum(steps, 1.0)
-    return out
+    return np.minimum(steps, 1.0)[np.argsort(order)]
 
 
 def whiteness(e: Float[np.ndarray, "seq time"], lags: int = LAGS) -> tuple[float, float, float]:
@@ -46,11 +48,8 @@ def autocorrelation(
     e: Float[np.ndarray, "seq time"], lags: int
 ) -> tuple[Float[np.ndarray, " lag"], Float[np.ndarray, " lag"]]:
     """Autocorrelation at lags 0 to `lags` samples over all sequences, and the number of pairs behind each."""
-    centred = e - np.nanmean(e)
-    seen = np.isfinite(centred)
-    filled = np.where(seen, centred, 0.0)
-    rows = e.shape[1]
-    spans = range(min(lags, rows - 1) + 1)
+    seen, rows = np.isfinite(e), e.shape[1]
+    filled, spans = np.where(seen, e - np.nanmean(e), 0.0), range(min(lags, rows - 1) + 1)
     pairs = np.asarray([np.sum(seen[:, : rows - k] & seen[:, k:]) for k in spans], float)
     sums = np.asarray([np.sum(filled[:, : rows - k] * filled[:, k:]) for k in spans])
     return sums / np.maximum(pairs, 1.0) * (pairs[0] / sums[0]), pairs
@@ -63,7 +62,7 @@ def spread(e: Float[np.ndarray, "seq time"]) -> tuple[float, float, float]:
     """
     x = e[np.isfinite(e)]
     mean = float(np.mean(x**2))
-    tails = scipy.stats.chi2.sf(x.size * mean, x.size), scipy.stats.chi2.cdf(x.size * mean, x.size)
+    tails = [tail(x.size * mean, x.size) for tail in (scipy.stats.chi2.sf, scipy.stats.chi2.cdf)]
     return mean, min(1.0, 2 * float(min(tails))), math.sqrt(mean) - 1.0
 
 
@@ -87,12 +86,69 @@ def dependence(e: Float[np.ndarray, "seq time"], cause: Float[np.ndarray, "seq t
 
 
 def _group_sums(values: Float[np.ndarray, "seq time"], seen: Bool[np.ndarray, "seq time"]):
-    """Sums over groups of about equally many readings: parts of sequences."""
-    active = seen.any(1)
-    values, seen = values[active], seen[active]
+    """Sums over groups of about equally many readings: parts of sequences, of which some are `seen`."""
+    rows = [row[known] for row, known in zip(values, seen, strict=True) if known.any()]
     groups, readings = 20, 50  # least number of groups, and of readings in a group where there are enough
-    parts = max(1, -(-groups // max(len(values), 1)), int(np.median(seen.sum(1)) // readings) if len(seen) else 1)
-    sums = []
-    for row, known in zip(values, seen, strict=True):
-        sums += [piece.sum() for piece in np.array_split(row[known], parts) if piece.size]
-    return np.asarray(sums)
+    parts = max(-(-groups // len(rows)), int(np.median([row.size for row in rows]) // readings))
+    return np.asarray([piece.sum() for row in rows for piece in np.array_split(row, parts) if piece.size])
+
+
+class Test(NamedTuple):
+    """One test of the innovations of one channel."""
+
+    name: str
+    channel: str
+    statistic: float
+    p_value: float
+    """Corrected for the number of tests [Holm 1979]."""
+    size: float
+    """Distance from a right model, whatever the number of samples: largest autocorrelation; standard deviation minus 1;
+    correlation."""
+    meaning: str
+    """The result in one sentence."""
+    slight: bool
+    """True where it failed by a size too small to matter."""
+
+
+def causes(residual: Residual, names: Names) -> Iterator[tuple[str, Float[np.ndarray, "seq time"]]]:
+    """Names and values of all, known one row before, that the innovations of a right model do not depend on."""
+    before = np.concatenate([np.full_like(residual.u[:, :1], np.nan), residual.u[:, :-1]], axis=1)
+    yield from zip(names.inputs, np.moveaxis(before, -1, 0), strict=True)
+    states = np.moveaxis(residual.predicted, -1, 0)
+    for name, q, turns in zip(names.coordinates, states, names.rotary, strict=False):
+        if turns:
+            yield from ((f"sin({name})", np.sin(q)), (f"cos({name})", np.cos(q)))
+        else:
+            yield name, q
+    for name, v in zip(names.rates, states[len(names.coordinates) :], strict=False):
+        yield name, v
+        yield f"|{name}| {name}", np.abs(v) * v
+    yield "time", residual.t
+
+
+KINDS = {  # of each test what is said where it passes, and where it fails; a correlation has its cause
+    "whiteness": ("are uncorrelated over time", "are correlated over time (up to {size:.2g}): {how}"),
+    "spread": ("are as large as the model expects", "are {times:.3g} times as large as the model expects"),
+    "correlation": ("show no link with {cause}", "change with {cause} (correlation {size:.2g})"),
+}
+SMALL_MISFIT = 0.1
+"""Size below which a failed test is called small."""
+
+
+def tests(residual: Residual, names: Names) -> list[Test]:
+    """All tests of the innovations of every measured channel, over the sequences that did not diverge."""
+    residual, rows, out = residual.followed(), [], []
+    for i, channel in enumerate(names.measured):
+        e = residual.innovation[..., i] if residual.t.size else np.zeros((0, 0))
+        if np.isfinite(e).sum() < 3 * LAGS or not np.nanstd(e) > 0:
+            continue
+        rows += [("whiteness", channel, whiteness(e)), ("spread", channel, spread(e))]
+        rows += [(f"correlation with {name}", channel, dependence(e, g)) for name, g in causes(residual, names)]
+    for (name, channel, (statistic, _, size)), p in zip(rows, holm([p for _, _, (_, p, _) in rows]), strict=True):
+        kind, _, cause = name.partition(" with ")
+        slight = bool(p < FAILS and abs(size) < SMALL_MISFIT)
+        how = "something acts that lasts" if size > 0 else "they alternate, as with filtered readings"
+        said = KINDS[kind][int(p < FAILS)].format(size=size, times=1 + size, how=how, cause=cause)
+        text = f"Errors in {channel} {said}{'; certain, but small' if slight else ''}."
+        out.append(Test(name, channel, statistic, float(p), size, text, slight))
+    return out

@@ -54,9 +54,8 @@ class Trial(NamedTuple):
     def rejection(self) -> Rejection | None:
         """Reason against it; None where there is none."""
         numbers = {name: getattr(self, name) for name in ("certainty", "amplitude", "removed", "before")}
-        return veto(
-            possible=self.effect.is_physical(), floor=self.screened.floor, complexity=complexity(self.effect), **numbers
-        )
+        possible, count = self.effect.is_physical(), complexity(self.effect)
+        return veto(possible=possible, floor=self.screened.floor, complexity=count, **numbers)
 
 
 class Null(NamedTuple):
@@ -71,15 +70,15 @@ def begun(hypothesis: Hypothesis, path: Gaussian, fit: SmoothedFit, loss: MultiS
     return loss.finish(fit, Refit(hypothesis.model, hypothesis.m_step, path, np.zeros(0), jnp.zeros((0, 0))))
 
 
-def fitted(start: Refit, fit: SmoothedFit, loss: MultiStep, passes: int) -> Refit:
+def fitted(start: Refit, fit: SmoothedFit, loss: MultiStep) -> Refit:
     """A refit after some passes from where it was begun, finished again."""
-    return loss.finish(fit, refit(start.model, start.m_step, start.path, fit.data, fit.used, passes=passes))
+    return loss.finish(fit, refit(start.model, start.m_step, start.path, fit.data, fit.used))
 
 
-def null_of(hypothesis: Hypothesis, fit: SmoothedFit, loss: MultiStep, passes: int) -> Null:
+def null_of(hypothesis: Hypothesis, fit: SmoothedFit, loss: MultiStep) -> Null:
     """`hypothesis` along the paths of `fit`, before its passes and after them."""
     start = begun(hypothesis, fit.path, fit, loss)
-    return Null(start, fitted(start, fit, loss, passes))
+    return Null(start, fitted(start, fit, loss))
 
 
 def leader(begun: Iterable[tuple[Trial, Refit]]) -> tuple[Trial, Refit]:
@@ -87,12 +86,11 @@ def leader(begun: Iterable[tuple[Trial, Refit]]) -> tuple[Trial, Refit]:
     return max(begun, key=lambda each: (each[0].effect.is_physical(), each[0].foreseen))
 
 
-def with_candidate(forms: Sequence[Screened], null: Null, fit: SmoothedFit, loss: MultiStep, passes: int) -> Trial:
+def with_candidate(forms: Sequence[Screened], null: Null, fit: SmoothedFit, loss: MultiStep) -> Trial:
     """A law in the model, or in the place of the law that it is another form of, refitted from the one of its `forms`
     whose step removes most and is physical: on the linear screen a friction of three periods may explain what five do.
 
-    Not refitted where the nonlinear error hardly falls along the step of the screen, friction and parameters moving
-    with it (`foreseen`).
+    Not refitted where the nonlinear error hardly falls along that step (`foreseen`).
     """
     hypothesis = fit.hypothesis
 
@@ -108,7 +106,7 @@ def with_candidate(forms: Sequence[Screened], null: Null, fit: SmoothedFit, loss
     form = trial.screened
     if not foreseen(trial.foreseen, form.floor, complexity(form.candidate.start), hidden=hypothesis.model.hides):
         return trial
-    end = fitted(start, fit, loss, passes)
+    end = fitted(start, fit, loss)
     trial = trial._replace(after=trial.after.refitted(end.model), refit=end)
     effect, cov = trial.effect, covariances(trial.after.model, trial.after.m_step, end.hessian)[-1]
     reported = estimates(effect, cov, trial.after.model.system).get("amplitude")
@@ -125,12 +123,10 @@ def explained(case: Trial, context: SearchContext) -> float:
     """
     if (fit := context.origin) is None:
         return -np.inf
-    full = fit.hypothesis.plus(case.effect, case.candidate)
-    null, other = (
-        context.loss.along(fit, one, path)
-        for one, path in ((fit.hypothesis, fit.path), (full, extended(full.model, fit.path, fit.data)))
-    )
-    return 1 - context.loss.ratio(null, other, fit, case.screened.band)
+    full, loss = fit.hypothesis.plus(case.effect, case.candidate), context.loss
+    null = loss.along(fit, fit.hypothesis, fit.path)
+    other = loss.along(fit, full, extended(full.model, fit.path, fit.data))
+    return 1 - loss.ratio(null, other, fit, case.screened.band)
 
 
 def certainty(candidate: Candidate, effect: AbstractEffect, cov: Float[np.ndarray, "param param"]) -> float:

@@ -3,8 +3,8 @@
 The search measures; this file decides.  A share is the part of a squared error that a candidate removes [0 to 1].
 Elsewhere: READINGS (`em/noise.py`), which chooses the horizons where a joint is hidden; the bars of tests
 (`statistics.py`), of external disturbances (`interventions.py`) and of the shape of a curve
-(`shapes.py`); and counts of parts, placebos, laws and passes (`folds.py screen.py rounds.py refit.py context.py
-columns.py equations.py`).
+(`shapes.py`); and counts of parts, placebos, laws and passes (`screen.py rounds.py refit.py context.py columns.py
+search.py equations.py`).
 """
 
 import math

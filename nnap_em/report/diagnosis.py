@@ -9,13 +9,13 @@ import numpy as np
 
 from ..data.logs import Logs
 from ..diagnosis.change import changes
-from ..diagnosis.findings import Finding, advice, entry, friction_change, suspected, undecided, verdict
-from ..diagnosis.innovations import tests
+from ..diagnosis.findings import Finding, advice, entry, suspected, undecided, verdict
 from ..diagnosis.interventions import Intervention
 from ..diagnosis.keys import Key, key_of, place_of, words
 from ..diagnosis.outcome import Diagnosis, Step
 from ..diagnosis.residual import Names, Residual, names_of, residual
 from ..diagnosis.search import unbranched
+from ..diagnosis.statistics import tests
 from ..fit.identify import FrictionTable, friction_table
 from ..fit.misfit import moved
 from ..fit.predict import Prediction
@@ -87,7 +87,6 @@ def write_diagnosis(
         "error": error,
         "models": {name: f"{name}.npz" for name in both},
         "visited": visited(diagnosis.before, velocities, train) if diagnosis.before.rig.friction else None,
-        "friction_change": friction_change(diagnosis, nodes),
         "tests": {name: [t._asdict() for t in each] for name, each in tested.items()},
         "parameters": {name: parameters(fitted) for name, fitted in both.items()},
         "noise": {name: noise(fitted) for name, fitted in both.items()},

@@ -141,7 +141,7 @@ def _errors(document: _Entry) -> list[Part]:
     tests = document.get("tests") or {}
     if tests.get("before"):
         out.append(_failures(tests["before"], tests.get("after")))
-    return [*out, document["friction_change"]] if document.get("friction_change") else out
+    return out
 
 
 def _change(before: Any, after: Any) -> str:

@@ -17,10 +17,10 @@ from datetime import date
 from pathlib import Path
 from typing import NamedTuple
 
-import diagnose
 from planted_make import ROOT
 
 sys.path.append(str(ROOT / "examples"))
+import plant
 import tanks
 
 from nnap_em.commands.common import MISFIT_STATUS
@@ -35,7 +35,7 @@ def _paper(folder: Path) -> None:
 
 
 def _slide(folder: Path) -> None:
-    diagnose.plant.write(diagnose.plant.Case(system="slide", sequences=8, steps=250, noise=(5e-4, 5e-3)), folder)
+    plant.write(plant.Case(system="slide", sequences=8, steps=250, noise=(5e-4, 5e-3)), folder)
 
 
 def _tanks(folder: Path) -> None:

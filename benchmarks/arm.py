@@ -1,22 +1,16 @@
 """Friction of every joint of an industrial arm of which all joints are read: declared by its file, logs from MuJoCo.
 
     python benchmarks/arm.py [--joints 6] [--seeds 3] [--first 0] [--imu]
-    python benchmarks/arm.py --lacks payload --out OUT      # `nnap-em diagnose` on logs of an arm with a payload
-    python benchmarks/arm.py --lacks off_axis --out OUT     # 2.8 kg, its centre 0.25 m off the axis of joint 6
-    python benchmarks/arm.py --lacks payload --joints 7 --size 4 400 --out OUT
 
 The arm follows sums of sines under gravity compensation and a PD controller; friction is Coulomb, viscous and Stribeck,
-of another size in every joint. 10 sequences of 5 s at 100 Hz, or `--size` sequences and rows. Seconds are those of
-`identify`. The first seed is cold where the cache of compiled programs (XDG_CACHE_HOME) is empty. With `--imu` the last
-joint has no encoder, and the hand a gyroscope and an accelerometer. With `--lacks` the machine has what its file does
-not say; OUT keeps logs and findings, and a seed that is found there is not run again.
+of another size in every joint. 10 sequences of 5 s at 100 Hz. Seconds are those of `identify`. The first seed is cold
+where the cache of compiled programs (XDG_CACHE_HOME) is empty. With `--imu` the last joint has no encoder, and the hand
+a gyroscope and an accelerometer.
 """
 
 import argparse
-import json
 import os
 import platform
-import subprocess
 import sys
 import time
 from collections.abc import Callable
@@ -33,7 +27,6 @@ from machines import arm
 from nnap_em import identify
 from nnap_em.commands.common import set_up
 from nnap_em.data.dataset import Dataset
-from nnap_em.data.formats import write_csv
 from nnap_em.data.rig import Rig, read_rig
 from nnap_em.systems import specs
 
@@ -46,8 +39,6 @@ NOISE = 1e-3
 """Of the readings [rad]."""
 IMU = {"gyro": 0.005, "accelerometer": 0.05}
 """Of the sensors at the hand [rad/s, m/s^2]."""
-HAND = (0.0, 0.0, 0.05)
-"""In the frame of the last body [m]."""
 BANDWIDTH = 12.0
 """Of the controller [rad/s]."""
 
@@ -74,27 +65,6 @@ JOINTS = (
 )
 
 
-class Lack(NamedTuple):
-    """What the machine has and its file does not say."""
-
-    payload: float = 0.0
-    """At the hand [kg]."""
-    away: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Centre of the payload from the hand [m]; where it is not 0, the controller is one of computed torque."""
-    late: int = 0
-    """Steps of the plant by which the input of joint 3 is late."""
-    spring: float = 0.0
-    """At joint 5 [N m/rad]."""
-
-
-LACKS = {
-    "payload": Lack(payload=0.4),
-    "off_axis": Lack(payload=2.8, away=(0.2, -0.15, 0.06)),
-    "late": Lack(late=2 * FINE),
-    "spring": Lack(spring=0.8),
-}
-
-
 def machine(joints: int, *, imu: bool) -> str:
     """The arm as MJCF, with or without sensors at its hand."""
     sensors = "".join(f'<{kind} name="hand_{kind}" site="hand"/>' for kind in IMU if imu)
@@ -112,30 +82,14 @@ def friction(joints: tuple[Joint, ...]) -> Callable[[np.ndarray], np.ndarray]:
     return law
 
 
-def plant(text: str) -> mujoco.MjModel:
-    """The machine of a file without friction, stops and contacts."""
+def recorded(text: str, joints: tuple[Joint, ...], seed: int) -> tuple[Dataset, np.ndarray]:
+    """Logs of the arm, of its hand in place of the last joint where there are sensors, and all its states."""
+    rng, law, dof = np.random.default_rng(seed), friction(joints), len(joints)
     model = mujoco.MjModel.from_xml_string(text)
     model.opt.timestep, model.opt.integrator = DT / FINE, int(mujoco.mjtIntegrator.mjINT_RK4)
     model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
-    return model
-
-
-def recorded(
-    text: str, joints: tuple[Joint, ...], seed: int, lack: Lack | None = None, size: tuple[int, int] = SIZE
-) -> tuple[Dataset, np.ndarray]:
-    """Logs of the arm, of its hand in place of the last joint where there are sensors, and all its states."""
-    lack, rng, law, dof = lack or Lack(), np.random.default_rng(seed), friction(joints), len(joints)
-    model = plant(text)
-    if lack.payload:
-        place = " ".join(f"{x:.6g}" for x in np.add(HAND, lack.away))
-        load = f'<body pos="{place}"><inertial pos="0 0 0" mass="{lack.payload}" diaginertia="1e-6 1e-6 1e-6"/></body>'
-        model_true = plant(text.replace('<site name="hand"', load + '<site name="hand"'))
-    else:
-        model_true = model
-    if any(lack.away):
-        model = model_true  # the controller knows the load, as on a robot that is told its payload
     inertia, speed = _inertia(model), np.array([joint.speed for joint in joints])
-    sequences, rows = size
+    sequences, rows = SIZE
     t = DT * np.arange(rows)
     u, x = np.zeros((sequences, rows, dof)), np.zeros((sequences, rows, 2 * dof))
     sensed = np.zeros((sequences, rows, model.nsensordata))
@@ -144,28 +98,20 @@ def recorded(
         turn = 2 * np.pi * tones[None] * t[:, None, None] + phases[None]
         rate = speed * np.sum(np.cos(turn), axis=-1) / 2.5
         goal = np.sum(speed[:, None] / 2.5 * np.sin(turn) / (2 * np.pi * tones), axis=-1)
-        data, known = mujoco.MjData(model_true), mujoco.MjData(model)
+        data, known = mujoco.MjData(model), mujoco.MjData(model)
         data.qpos[:], data.qvel[:] = goal[0], rate[0]
-        sent = [np.zeros(dof)] * (lack.late + 1)
         for k in range(rows):
             x[s, k] = np.concatenate([data.qpos, data.qvel])
             known.qpos[:], known.qvel[:] = data.qpos, data.qvel
             mujoco.mj_forward(model, known)
-            miss, slip = goal[k] - data.qpos, rate[k] - data.qvel
-            wish = BANDWIDTH**2 * miss + 1.4 * BANDWIDTH * slip
-            u[s, k] = known.qfrc_bias + (_mass(model, known) @ wish if any(lack.away) else inertia * wish)
+            wish = BANDWIDTH**2 * (goal[k] - data.qpos) + 1.4 * BANDWIDTH * (rate[k] - data.qvel)
+            u[s, k] = known.qfrc_bias + inertia * wish
             data.ctrl[:], data.qfrc_applied[:] = u[s, k], law(data.qvel)
-            mujoco.mj_forward(model_true, data)
+            mujoco.mj_forward(model, data)
             sensed[s, k] = data.sensordata
             for _ in range(FINE):
-                sent = [*sent[1:], u[s, k]]
-                data.ctrl[:] = u[s, k]
-                if lack.late:
-                    data.ctrl[2] = sent[0][2]
                 data.qfrc_applied[:] = law(data.qvel)
-                if lack.spring:
-                    data.qfrc_applied[4] -= lack.spring * data.qpos[4]
-                mujoco.mj_step(model_true, data)
+                mujoco.mj_step(model, data)
     read = dof - bool(model.nsensor)
     std = np.repeat([NOISE, *IMU.values()][: 1 + model.nsensor], [read, *model.sensor_dim])
     y = np.concatenate([x[..., :read], sensed], axis=-1)
@@ -175,16 +121,10 @@ def recorded(
 
 def _inertia(model: mujoco.MjModel) -> np.ndarray:
     """Of every joint at zero [kg m^2]."""
-    data = mujoco.MjData(model)
+    data, mass = mujoco.MjData(model), np.zeros((model.nv, model.nv))
     mujoco.mj_forward(model, data)
-    return np.diag(_mass(model, data))
-
-
-def _mass(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
-    """Mass matrix at the state of `data`."""
-    mass = np.zeros((model.nv, model.nv))
     mujoco.mj_fullM(model, data, mass)
-    return mass
+    return np.diag(mass)
 
 
 def declared(folder: Path, joints: int, *, imu: bool = False) -> Rig:
@@ -202,63 +142,25 @@ def declared(folder: Path, joints: int, *, imu: bool = False) -> Rig:
     return read_rig(folder / "rig.toml", specs)
 
 
-def written(rig: Rig, data: Dataset, folder: Path) -> None:
-    """The logs as files beside the rig."""
-    for i, (t, u, y) in enumerate(zip(data.t, data.u, data.y, strict=True)):
-        columns = dict(zip((*rig.input_columns, *rig.measured), (*np.asarray(u).T, *np.asarray(y).T), strict=True))
-        write_csv(folder / "train" / f"{i:03d}.csv", {"time": np.asarray(t)} | columns)
-
-
-def diagnosed(kind: str, seed: int, out: Path, count: int, size: tuple[int, int], *, imu: bool) -> str:
-    """What `nnap-em diagnose` names in a machine that lacks something, and how long it took; a row of the table."""
-    folder, result = out / f"{kind}_{seed}", out / f"{kind}_{seed}_found"
-    if not (result / "report.json").exists():
-        (folder / "train").mkdir(parents=True, exist_ok=True)
-        data, _ = recorded(machine(count, imu=imu), JOINTS[:count], seed, LACKS[kind], size)
-        written(declared(folder, count, imu=imu), data, folder)
-        command = ["diagnose", str(folder), "--out", str(result), "--seed", str(seed), "--quiet"]
-        began, before = time.perf_counter(), os.times().children_user
-        subprocess.run([sys.executable, "-m", "nnap_em.commands.cli", *command], check=True)
-        took, spent = time.perf_counter() - began, os.times().children_user - before
-        (result / "seconds.json").write_text(json.dumps([took, spent]))
-    report = json.loads((result / "report.json").read_text())
-    took, spent = json.loads((result / "seconds.json").read_text())
-    named = "; ".join(f"{e['name']} {e['joint']}: {_numbers(e)}" for e in report["effects"])
-    return f"| {kind} | {seed} | {named or 'nothing'} | {took:.0f} | {spent:.0f} |"
-
-
-def _numbers(effect: dict) -> str:
-    """Parameters of an effect with their standard deviations."""
-    return ", ".join(f"{name} {p['value']:.3g} +- {p['std']:.1g}" for name, p in effect["parameters"].items())
-
-
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--joints", type=int, default=6, choices=range(1, 8))
-    parser.add_argument("--size", type=int, nargs=2, default=SIZE, help="sequences and rows (10 501)")
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--first", type=int, default=0, help="seed")
     parser.add_argument("--imu", action="store_true", help="at the hand, in place of the last encoder")
-    parser.add_argument("--lacks", choices=LACKS)
-    parser.add_argument("--out", type=Path)
     args = parser.parse_args()
     set_up()
     joints = JOINTS[: args.joints]
     print(f"{date.today()}, {platform.machine()}, {jax.device_count()} devices, JAX {jax.__version__}, ", end="")
     print(f"load {os.getloadavg()[0]:.1f} before: {' '.join(['python', *sys.argv])}\n")
     seeds = range(args.first, args.first + args.seeds)
-    if args.lacks:
-        print("| lacks | seed | named | s | processor s |\n| --- | --- | --- | --- | --- |")
-        for seed in seeds:
-            print(diagnosed(args.lacks, seed, args.out, args.joints, tuple(args.size), imu=args.imu), flush=True)
-        return
     print(f"| seed | {' | '.join(f'joint {i + 1}' for i in range(args.joints))} | epochs | s | processor s |")
     print("| --- " * (args.joints + 4) + "|")
     with TemporaryDirectory() as folder:
         rig = declared(Path(folder), args.joints, imu=args.imu)
         for seed in seeds:
-            data, x = recorded(machine(args.joints, imu=args.imu), joints, seed, size=tuple(args.size))
+            data, x = recorded(machine(args.joints, imu=args.imu), joints, seed)
             began, spent = time.perf_counter(), time.process_time()
             fitted = identify(rig, data, key=jax.random.key(seed))
             took, spent = time.perf_counter() - began, time.process_time() - spent

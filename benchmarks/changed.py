@@ -3,15 +3,13 @@
     python benchmarks/changed.py planted --out out/changed dfki_c1-spring2-strong dfki_c0-recorded ...
     python benchmarks/changed.py moved --out out/changed slide-coulomb pendulum-none ...
     python benchmarks/changed.py real --out out/changed dfki_c1-coulomb dfki_c0-viscous cloudpendulum-mass
-    python benchmarks/changed.py loaded --out out/changed kr300-15
     python benchmarks/changed.py table out/changed [--out docs/results/changed_planted.csv]
 
 planted: a fit of every second recording of a rig as it is, then the others with the effect of the case (planted.py)
 planted in them; of `RIG-recorded` nothing is planted.  real: the same with a number of joint 2 that moved, its Coulomb
 friction by 20 % of the published, its viscous friction by as much torque at the typical speed, or its mass by 5 %.
 moved: 8 simulated recordings of 3 s, then 8 of the machine with a number that moved; `slide-coulomb-2` is seed 2.
-loaded: half of the recordings of an arm, then the others with so many kilograms more at
-the centre of mass of its last body.  One JSON file a case; a case that has one is not run again.
+One JSON file a case; a case that has one is not run again.
 """
 
 import argparse
@@ -27,19 +25,16 @@ import shutil
 import subprocess
 import sys
 import tempfile
-import tomllib
 from pathlib import Path
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 from planted import _commit, score
 from planted_cases import REST, case_of
 from planted_make import DATA, ROOT, make, needed, read
-from scipy.signal import savgol_filter
 
 from nnap_em.commands.common import MISFIT_STATUS
 from nnap_em.data.formats import write_csv
@@ -131,40 +126,6 @@ def real(name: str, out: Path) -> dict[str, Any]:
     return {"case": name, "moved": more[kind], "report": report, "seconds": spent, "said": said}
 
 
-def loaded(name: str, out: Path) -> dict[str, Any]:
-    """The other half of an arm's recordings, with a heavier last body in them: by MuJoCo, along the smoothed path."""
-    rig, more = name.split("-")
-    fit, half, found = fit_of(rig, out), out / "halves" / name, out / "found" / name
-    shutil.rmtree(half, ignore_errors=True)
-    halves(DATA / rig, DATA / rig / "rig.toml", half, True)
-    (model_file,) = half.glob("*.xml")
-    light, heavy = (mujoco.MjModel.from_xml_path(str(model_file)) for _ in range(2))
-    heavy.body_mass[-1] += float(more)
-    inputs = tomllib.loads((half / "rig.toml").read_text())["input"]
-    drives = dict(zip(inputs["joints"], inputs["columns"], strict=True))
-    joints = [light.joint(j).name for j in range(light.njnt)]
-    for path in half.glob("train/*.csv"):
-        log = np.genfromtxt(path, delimiter=",", names=True)
-        dt = float(np.mean(np.diff(log["time"])))
-        path_of = [savgol_filter([log[j] for j in joints], 11, 3, order, dt) for order in range(3)]
-        force = inverse(heavy, path_of) - inverse(light, path_of)
-        mean = np.concatenate([0.5 * (force[:-1] + force[1:]), force[-1:]])
-        torques = {drives[j]: log[drives[j]] + mean[:, i] for i, j in enumerate(joints)}
-        write_csv(path, {n: log[n] for n in log.dtype.names} | torques)
-    status, spent, said = command("diagnose", half, "--from", fit, "--out", found)
-    report = json.loads((found / "report.json").read_text()) if status in (0, MISFIT_STATUS) else None
-    return {"case": name, "report": report, "seconds": spent, "said": said}
-
-
-def inverse(model: mujoco.MjModel, path: list[np.ndarray]) -> np.ndarray:
-    """Torques (time, joint) of angles, rates and accelerations (joint, time)."""
-    data, out = mujoco.MjData(model), []
-    for data.qpos[:], data.qvel[:], data.qacc[:] in zip(*(a.T for a in path), strict=True):
-        mujoco.mj_inverse(model, data)
-        out.append(data.qfrc_inverse.copy())
-    return np.array(out)
-
-
 def machine(system: str, kind: str):
     """A machine whose last joint, or mass, moved by the step of `FACTOR`."""
     truth, sweep = examples[system]()
@@ -236,7 +197,7 @@ def main() -> None:
     """Run some cases, or write the table."""
     arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     commands = arguments.add_subparsers(dest="command", required=True)
-    kinds = {"planted": planted, "real": real, "moved": moved, "loaded": loaded}
+    kinds = {"planted": planted, "real": real, "moved": moved}
     for kind in kinds:
         one = commands.add_parser(kind)
         one.add_argument("cases", nargs="+")

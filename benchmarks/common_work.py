@@ -22,12 +22,8 @@ from nnap_em.model.friction import AbstractJointMap
 from nnap_em.model.simulate import Experiment, paper_friction, paper_model, paper_sweep, sweep_experiment
 from nnap_em.model.state_space import StateSpaceModel
 from nnap_em.numerics.gaussian import Gaussian
-from nnap_em.smoother.gaussian import CubatureSmoother, ExtendedKalmanSmoother
-from nnap_em.smoother.particle import (
-    ParticleSmoother,
-    ffbs,
-    particle_filter,
-)
+from nnap_em.smoother.gaussian import ExtendedKalmanSmoother
+from nnap_em.smoother.particle import ffbs, particle_filter
 from nnap_em.smoother.start import StartBank
 
 START, START_STD = (math.pi / 2, 0.0, 0.0, 0.0), (0.05, 0.05, 0.05, 0.05)
@@ -125,8 +121,8 @@ class Case(NamedTuple):
     size: Size
     prepare: Callable[[], Callable[[], Any]]
     """Compiles, and gives what is timed."""
-    states: Callable[[Any], Any] | None = None
-    """Estimated states (seq, time, state) of a result; none where nothing is estimated."""
+    states: Callable[[Any], Any]
+    """Estimated states (seq, time, state) of a result."""
 
 
 def compiled(function, *args) -> Callable[[], Any]:
@@ -184,8 +180,3 @@ def paths_case(name: str, proposal, backward, size: Size) -> Case:
         return ffbs(history, backward, num_paths=size.particles, key=key_paths).x
 
     return Case("nnap_em", name, size, lambda: _each(one, size), lambda x: jnp.mean(x, axis=2))
-
-
-def particle_default(particles: int = 300, paths: int = 100) -> ParticleSmoother:
-    """The particle smoother as the library sets it."""
-    return ParticleSmoother(CubatureSmoother(wide_bank), num_particles=particles, num_paths=paths)

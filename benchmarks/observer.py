@@ -1,7 +1,6 @@
 """The observer on the paper's acrobot with theta2 hidden: beside the filter of the true model, its time, C and Python.
 
-python benchmarks/observer.py                                                       # some minutes
-python benchmarks/observer.py --steps 10000000 --table docs/results/observer.md     # and as many under sanitizers
+python benchmarks/observer.py [--table docs/results/observer.md]     # some minutes
 """
 
 import argparse
@@ -19,14 +18,12 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
-from arm import JOINTS, declared, machine, recorded
-from observer_c import SANITIZED, held, paper_rig, play, replay, rough, wild
+from observer_c import held, paper_rig, play, replay, rough
 
 import nnap_em
 from nnap_em.data.dataset import Dataset
-from nnap_em.data.rig import Declared, Rig
 from nnap_em.export.online import write_observer
-from nnap_em.fit.identify import Identified, begin, identify
+from nnap_em.fit.identify import Identified, identify
 from nnap_em.fit.observer import RESTARTED, Observer, functions, observer, restart_prior
 from nnap_em.fit.store import load, save
 from nnap_em.model.simulate import paper_experiment, paper_model
@@ -92,40 +89,11 @@ def alike(fitted: Identified, truth: StateSpaceModel, rows: int, folder: Path) -
     yield "a step in Python, jitted, theta2 hidden", f"{1e6 * python_time(online, u[:2000], clean[:2000]):.0f} us"
 
 
-def six_joints(folder: Path) -> Iterator[tuple[str, str]]:
-    """Time of a step for the arm of `arm.py`, all joints read, its numbers those before a fit."""
-    rig = declared(folder, 6)
-    data, _ = recorded(machine(6, imu=False), JOINTS[:6], 0)
-    fitted, source = begin(rig, data, key=jax.random.key(0)), folder / "six.c"
-    write_observer(fitted, source)
-    t, u, y = (np.asarray(a[0]) for a in (data.t, data.u, data.y))
-    lines = source.read_text().count("\n")
-    seconds = [play(source, t, held(u), y, 12, np.float64, *options).seconds for options in ((), (NATIVE,))]
-    yield f"a step in C for six joints ({lines} lines); {NATIVE}", f"{1e6 * seconds[0]:.0f}; {1e6 * seconds[1]:.0f} us"
-
-
-def wild_runs(fitted: Identified, steps: int, folder: Path) -> Iterator[tuple[str, str]]:
-    """Steps with any input under the sanitizers: of a pendulum, and a hundredth of them with branches."""
-    t = 0.01 * np.arange(300)
-    swing = np.stack([np.sin(3 * t), 3 * np.cos(3 * t)], axis=1)[None]
-    names = {key: Declared(value, 0.0) for key, value in (("m", 0.5), ("lc", 0.2), ("I", 0.002), ("g", 9.81))}
-    rig = Rig("pendulum", "pendulum", names, True, ("u",), (1,), 0.01, "sequence", ("theta1", "dtheta1"),
-              {"theta1": 0.01, "dtheta1": 0.05}, {})  # fmt: skip
-    pendulum = begin(rig, Dataset(t[None], swing[..., :1], swing, np.ones((1, 300), bool)), key=jax.random.key(0))
-    for name, one, count in (("pendulum", pendulum, steps), ("acrobot", fitted, steps // 100)):
-        for bits in (64, 32):
-            write_observer(one, folder / f"{name}{bits}.c", single=bits == 32)
-            counts = wild(folder / f"{name}{bits}.c", count, *SANITIZED)
-            flagged = "{} new starts, {} rows in several branches, {} rows with outliers"
-            yield f"{count} wild steps, {name}, {bits} bits, address and undefined", flagged.format(*counts)
-
-
 def main() -> int:
     """Fit, compare, time."""
     arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     arguments.add_argument("--sequences", type=int, default=20, help="test sequences of 5 s (20)")
     arguments.add_argument("--rows", type=int, default=10_000, help="rows of C beside Python (10,000)")
-    arguments.add_argument("--steps", type=int, default=0, help="steps under the sanitizers (0)")
     arguments.add_argument("--fit", type=Path, default=Path("out/observer_fit/model.npz"), help="kept from run to run")
     arguments.add_argument("--table", type=Path, help="page to write")
     args = arguments.parse_args()
@@ -142,7 +110,6 @@ def main() -> int:
     table = ["| | |", "| --- | --- |"]
     with tempfile.TemporaryDirectory() as name:
         parts = [accuracy(fitted, truth, args.sequences), alike(fitted, truth, args.rows, Path(name))]
-        parts += [six_joints(Path(name)), wild_runs(fitted, args.steps, Path(name)) if args.steps else ()]
         for what, value in itertools.chain(*parts):
             table.append(f"| {what} | {value} |")
             print(table[-1], flush=True)

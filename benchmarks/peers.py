@@ -1,16 +1,14 @@
-"""The common work in the peers' hands: dynamax, cuthbert and particles.
+"""The common work in the peers' hands: dynamax and cuthbert.
 
 They get the transition as their user would write it, and this library's own in rows of their own.
 """
 
-import dataclasses
 import math
 from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
-import numpy as np
-from common_work import Case, Network, Size, common_logs, common_model, compiled
+from common_work import Case, Size, common_logs, common_model, compiled
 
 from nnap_em.model.state_space import Inputs, StateSpaceModel
 
@@ -135,68 +133,3 @@ def cuthbert_exact():
     from cuthbertlib.smc.smoothing import exact_sampling
 
     return exact_sampling.simulate
-
-
-def particles_case(size: Size) -> Case:
-    """The bootstrap filter of `particles`, in numpy and 64 bits."""
-
-    def prepare():
-        from particles import SMC, collectors, distributions, state_space_models
-
-        model, data = common_model(), common_logs(size).data
-        transition = numpy_transition(model)
-        q, r = np.exp(np.asarray(model.log_q, float)), np.exp(np.asarray(model.log_r, float))
-        mean, cov = (np.asarray(a, float) for a in model.start)
-        y, u = np.asarray(data.y, float), np.asarray(data.u, float)
-
-        class Acrobot(state_space_models.StateSpaceModel):
-            def PX0(self):
-                return distributions.MvNormal(loc=mean, cov=cov)
-
-            def PX(self, t, xp):
-                return distributions.MvNormal(loc=transition(xp, self.u[t - 1]), cov=np.diag(q))
-
-            def PY(self, t, xp, x):
-                return distributions.MvNormal(loc=x[:, [0, 2]], cov=np.diag(r))
-
-        def one(seq):
-            fk = state_space_models.Bootstrap(ssm=Acrobot(u=u[seq]), data=y[seq])
-            smc = SMC(fk=fk, N=size.particles, resampling="systematic", ESSrmin=0.5, collect=[collectors.Moments()])
-            smc.run()
-            return np.stack([m["mean"] for m in smc.summaries.moments])
-
-        return lambda: np.stack([one(seq) for seq in range(size.sequences)])
-
-    return Case("particles", f"bootstrap filter, {size.particles}", size, prepare, lambda x: x)
-
-
-def numpy_transition(model: StateSpaceModel):
-    """`natural_transition` for an array (particle, state) of numpy."""
-    arm = {f.name: float(getattr(model.system, f.name)) for f in dataclasses.fields(model.system) if f.name != "joints"}
-    a = type("Arm", (), arm)
-    nets = [Network(*(np.asarray(w, float) for w in net)) for net in model.unknown.joints]
-    coupling, m22 = a.m2 * a.l1 * a.lc2, a.I2 + a.m2 * a.lc2**2
-
-    def torque(net, v):
-        hidden = np.tanh(v[:, None] * net.first + net.first_bias)
-        return np.tanh(hidden @ net.second.T + net.second_bias) @ net.last + net.last_bias
-
-    def rate(x, u):
-        q1, q2, v1, v2 = x.T
-        cross, h = coupling * np.cos(q2), coupling * np.sin(q2)
-        m11, m12 = a.I1 + a.m1 * a.lc1**2 + m22 + a.m2 * a.l1**2 + 2 * cross, m22 + cross
-        outer = a.m2 * a.lc2 * a.g * np.sin(q1 + q2)
-        gravity = (a.m1 * a.lc1 + a.m2 * a.l1) * a.g * np.sin(q1) + outer
-        f1 = torque(nets[0], v1) - gravity + h * v2 * (2 * v1 + v2)
-        f2 = u[0] + torque(nets[1], v2) - outer - h * v1**2
-        det = m11 * m22 - m12**2
-        return np.stack([v1, v2, (m22 * f1 - m12 * f2) / det, (m11 * f2 - m12 * f1) / det], axis=1)
-
-    def transition(x, u):
-        k1 = rate(x, u)
-        k2 = rate(x + 0.5 * model.dt * k1, u)
-        k3 = rate(x + 0.5 * model.dt * k2, u)
-        k4 = rate(x + model.dt * k3, u)
-        return x + model.dt / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
-
-    return transition

@@ -1,7 +1,7 @@
 """kill -9, Ctrl-C and disks that are full: the last good state is kept and told, and the numbers are those of no fault.
 
 Every kind of fault hits a command whose steps cost nothing, in this process.  One run of `diagnose` is killed in a
-process of its own and goes on to its end.  `benchmarks/faults.py` kills many, at moments drawn from a seed.
+process of its own and goes on to its end.
 """
 
 import errno
@@ -22,7 +22,6 @@ import jax.numpy as jnp
 import numpy as np
 import plant
 import pytest
-from faults import numbers
 from helpers import begun
 from shell import ENVIRONMENT
 
@@ -40,6 +39,24 @@ from nnap_em.systems import specs
 
 SPRING = {"name": "torsional_spring", "joint": 1, "k": 20.0, "theta0": 0.05}
 SLIDE = plant.Case(system="slide", sequences=8, tests=1, steps=95, seed=2, noise=(5e-4, 5e-3), effects=(SPRING,))
+
+
+def numbers(out: Path) -> dict:
+    """Everything that a run leaves behind but the seconds that it took."""
+    contents: dict = {}
+    for path in sorted(out.glob("*.npz")):
+        with np.load(path) as stored:
+            arrays = {n: stored[n].tobytes() for n in stored.files if n not in ("header", "sha256")}
+            header = json.loads(stored["header"].tobytes())
+            header.pop("notes")
+            contents[path.name] = arrays, header
+    for path in sorted(out.glob("*.csv")):
+        contents[path.name] = path.read_bytes()
+    report = json.loads((out / "report.json").read_text())
+    report.pop("seconds")
+    for epoch in report.get("epochs", []):
+        epoch.pop("seconds")
+    return contents | {"report": report}
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 
 from ..numerics.digits import counted
 from .dataset import DataError, Dataset, pad
-from .formats import check_size, columns_of, header_hint, log_files, place, refuse, table_of, untimed
+from .formats import columns_of, header_hint, log_files, place, refuse, table_of, untimed
 from .held import hold
 from .held import repeats as held_rows
 from .missing import interpolated
@@ -235,7 +235,6 @@ def _masked(source: _Table, kind: str, column: str, rows: Int[np.ndarray, " row"
 
 
 def _read_table(path: Path, rig: Rig) -> _Table:
-    check_size(path)
     content = table_of(path)
     clock = ("time",) if "time" in content.names or header_hint(path) or untimed(content.names) else ()
     table = columns_of(content, (*clock, *rig.logged_inputs), rig.measured)

@@ -68,8 +68,8 @@ def implausible(
         if observed.size > 1 and np.ptp(observed) == 0:
             yield Implausible(False, name, None, f"constant at {observed[0]:g}", "is the sensor alive?")
     for name, values in readings.items():
-        if unit(name) in ("rad", "m", "rad/s", "m/s"):
-            yield from _wrapped(name, values, unit(name))
+        if unit(name) in ("rad", "m"):
+            yield from _wrapped(name, values, unit(name) == "rad")
     yield from _copies(inputs, readings)
     for name, rate in pairs:
         yield from _pair(name, rate, {**inputs, **readings}, dt, unit(name) == "rad")
@@ -176,14 +176,13 @@ def _advance(values: Float[np.ndarray, " time"], dt: float) -> Float[np.ndarray,
     return values[span:] - values[:-span]
 
 
-def _wrapped(name: str, values: Float[np.ndarray, " time"], unit: str) -> Iterator[Implausible]:
+def _wrapped(name: str, values: Float[np.ndarray, " time"], angle: bool) -> Iterator[Implausible]:
     """Jumps of a counter that starts over."""
-    rate = unit.endswith("/s")
-    found = counter(values, angle=unit == "rad", rate=rate)
+    found = counter(values, angle=angle)
     if found is not None:
         row = int(found.rows[0])
         hint = f"take the jumps out: nnap-em import LOG ... --rig rig.toml --out NEW --unwrap {shlex.quote(name)}"
-        hint += " (and convert degrees to rad)" if found.size == 360.0 and not rate else ""
+        hint += " (and convert degrees to rad)" if found.size == 360.0 else ""
         problem = f"{found}, in {counted(found.rows.size, 'place')}, here to {values[row]:.6g}"
         yield Implausible(True, name, row, problem, hint)
 

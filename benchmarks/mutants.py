@@ -596,17 +596,17 @@ nanoseconds of a stamp left out
 # import_/clock.py
 ## test_recordings.py::test_which_clock_is_taken_and_why[backwards]
 header stamps that run backwards are taken
-- back = np.flatnonzero(np.diff(stamp) < 0)
-+ back = np.flatnonzero(np.diff(stamp) < -1e18)
+- np.sum(np.diff(used) < 0)
++ np.sum(np.diff(used) < -1e18)
 ## test_clocks.py::test_which_times_are_of_one_clock
 fewer rows are left out than are no sequence
 - few = size <= 50
 + few = size < 50
 # data/formats.py
-## test_clocks.py::test_a_csv_file_in_blocks_is_the_same
+## test_clocks.py::test_fields_are_named_by_their_lines
 a short row is named by the line after
-- refuse(self.path, f"line {at}", problem, hint if
-+ refuse(self.path, f"line {at + 1}", problem, hint if
+- return refuse(self.path, f"line {at}"
++ return refuse(self.path, f"line {at + 1}"
 a field is named by the line before
 - f"line {self.first + line}, column {name!r}"
 + f"line {self.first + line - 1}, column {name!r}"

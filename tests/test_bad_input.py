@@ -14,7 +14,6 @@ from hypothesis import strategies as st
 from nnap_em.commands import cli
 from nnap_em.commands import identify as identify_command
 from nnap_em.data.dataset import DataError
-from nnap_em.data.formats import LARGEST_FILE
 from nnap_em.em.loop import FitError
 
 MODEL = 'type = "pendulum"\nm = 0.5\nlc = 0.4\nI = 0.002\ng = 9.81\nfriction = "unknown"\nactuated_joint = 1\n'
@@ -77,11 +76,6 @@ def _swap(one: str, two: str) -> Callable[[str], str]:
     return _columns(lambda log: {one: log[two], two: log[one]})
 
 
-def _huge(folder: Path) -> None:
-    with (folder / "train/01.csv").open("r+b") as file:
-        file.truncate(LARGEST_FILE + 2**20)  # sparse: it takes no place on the disk
-
-
 @_with
 def _everywhere(folder: Path, name: str, change) -> None:
     """A change of one column of all files."""
@@ -114,51 +108,29 @@ LOGS = {  # name: (the change of train/01.csv, the words of the message: place |
     "column cut off": (lambda s: "\n".join(line.rpartition(",")[0] for line in s.splitlines()),
         "column 'dtheta1' | missing | log it, or correct the columns of rig.toml"),
     "column misspelt": (lambda s: s.replace("dtheta1", "dteta1"), "'dtheta1' | missing | did you mean 'dteta1'?"),
-    "column in capitals": (lambda s: s.replace("u,", "U,"),
-        "column 'u' | missing | did you mean 'U'? | or correct [input] columns"),
     "column twice": (lambda s: s.replace("dtheta1", "theta1"), "column 'theta1' | 2 times | keep one"),
     "semicolons": (lambda s: s.replace(",", ";").replace(".", ","), "line 1 | missing | not ';'"),
-    "tabs": (lambda s: s.replace(",", "\t"), "line 1 | missing | by ',' (not '\\t') | or `nnap-em import` it"),
     "decimal commas": (lambda s: s.replace(".", ","), "line 3 | found 8 fields under 4 names | decimals with '.'"),
     "text in a reading": (with_field(9, "theta1", "0.1 rad"),
         "line 9, column 'theta1' | '0.1 rad' | leave the field empty"),
     "minus nan in an input": (with_field(9, "u", "-NaN"), "line 9, column 'u' | '-NaN' | write a number | never empty"),
-    "blank time": (with_field(202, "time", " "), "line 202, column 'time' | found '' | never empty"),
-    "zero bytes": (with_field(9, "u", "\0\0"), "line 9, column 'u' | \\x00 | write a number"),
     "row too long": (lambda s: s.replace("\n0.03,", "\n0.03,1,"), "line 5 | 5 fields under 4 | every column a field"),
     "blank line": (lambda s: s.replace("\n0.03,", "\n\n0.03,"), "line 5 | 1 field under 4 | every column a field"),
     "gap of half a row": (_column("time", lambda t: t + 0.004 * (np.arange(t.size) > 4)),
         "line 7, column 'time' | jitter: 0.04 | empty field"),
-    "gaps everywhere": (lambda s: "".join(line for i, line in enumerate(s.splitlines(True)) if i % 3 or not i),
-        "column 'time' | a gap: 0.01 s, then 0.03 s (66 places in all) | resample"),
     "row twice": (lambda s: s.replace("\n0.04,", "\n0.03,"),
         "line 6, column 'time' | does not run on | resample to uniform rows with `nnap-em import` | (dt = 0.01 s)"),
     "jitter": (_column("time", lambda t: t + 0.0002 * (np.arange(t.size) == 7)),
         "line 9, column 'time' | jitter: 0.06 s, then 0.0702 s (2 places | resample"),
     "another dt": (_column("time", lambda t: 2 * t), "column 'time' | 0.02 s apart | correct [sampling] dt"),
-    "milliseconds": (_column("time", lambda t: 1000 * t), "column 'time' | 10 s apart | one of the two is in ms"),
-    "time backwards": (_column("time", lambda t: -t), "column 'time' | -0.01 s apart | correct [sampling] dt"),
     "late start": (_column("time", lambda t: t + 5), "line 2, column 'time' | starts at 5 s | clock = \"session\""),
     "never measured": (_column("theta1", lambda x: x * np.nan), "column 'theta1' | no sample | [measurement]"),
     "wrapped": (_column("theta1", _wrap), "line 125, column 'theta1' | jumps by 6.283, in 2 places | --unwrap theta1"),
-    "wrapped degrees": (_column("theta1", lambda x: np.degrees(_wrap(x))),
-        "line 125 | jumps by 360, in | degrees to rad"),
     "angle in degrees": (_column("theta1", np.degrees), "column 'theta1' | 57.3 times | write rad"),
-    "rate in degrees": (_column("dtheta1", np.degrees), "column 'dtheta1' | 0.0175 times | write rad and rad/s"),
-    "angle in turns": (_column("theta1", lambda x: x / (2 * np.pi)),
-        "column 'theta1' | 0.159 times | turns: write rad"),
-    "angle in mrad": (_column("theta1", lambda x: 1e3 * x), "column 'theta1' | 1e+03 times | write SI units"),
     "rate in rpm": (_column("dtheta1", lambda x: x * 30 / np.pi), "column 'dtheta1' | 0.105 times | rpm: write rad/s"),
-    "rate in mrad/s": (_column("dtheta1", lambda x: 1e3 * x), "column 'dtheta1' | 0.001 times | write SI units"),
     "sign": (_column("dtheta1", np.negative), "column 'dtheta1' | minus column 'dtheta1' | turn the sign"),
     "angle and rate swapped": (_swap("theta1", "dtheta1"),
         "column 'theta1' | is the rate of 'dtheta1'; swap the names 'theta1'"),
-    "input and angle swapped": (_swap("u", "theta1"),
-        "column 'theta1' | is the rate of 'u'; swap the names 'theta1' and 'u'"),
-    "input and rate swapped": (_swap("u", "dtheta1"),
-        "column 'dtheta1' | 'u' is the rate | swap the names 'dtheta1' and 'u'"),
-    "angle twice": (_columns(lambda log: {"dtheta1": log["theta1"]}), "'dtheta1' | same numbers | each sensor reads"),
-    "input as rate": (_columns(lambda log: {"dtheta1": log["u"]}), "'dtheta1' | as column 'u' | each sensor reads"),
 }  # fmt: skip
 FOLDERS = {  # name: (the change of the folder, the words of the message, the file first); more in test_rig.py
     "no rig": (lambda f: (f / "rig.toml").unlink(), "rig.toml | cannot be read | a folder with a rig.toml"),
@@ -166,16 +138,8 @@ FOLDERS = {  # name: (the change of the folder, the words of the message, the fi
     "parameters missing": (_rig("lc = 0.4\nI = 0.002\n", ""), "rig.toml | [model] lc, I: missing (found only: type, m, "
         "g, friction, actuated_joint); write lc = 0.2 | , and so on"),
     "no train": (lambda f: shutil.rmtree(f / "train"), "train | is no folder | one CSV file per sequence"),
-    "spreadsheets": (lambda f: [path.rename(path.with_suffix(".xlsx")) for path in f.glob("train/*")],
-        "train | found there: 00.xlsx, 01.xlsx | one CSV file per sequence"),
-    "a sequence in two formats": (lambda f: (f / "train/00.mat").write_bytes(b""),
-        "train/00.mat | there is a 00.csv beside it | remove or rename one"),
-    "a sequence in two formats, and another between": (
-        lambda f: [(f / name).write_bytes(b"") for name in ("train/00.d.csv", "train/00.mat")],
-        "train/00.mat | there is a 00.csv beside it | remove or rename one"),
     "a folder for a file": (lambda f: [(f / "train/01.csv").unlink(), (f / "train/01.csv").mkdir()],
         "train/01.csv | cannot be read | check the path"),
-    "huge": (_huge, "train/01.csv | 257 MB | cut it into sequences"),
     "bad test file": (lambda f: (f / "test/00.csv").write_text(csv_text(swing(phase=1.0)).replace("time", "tme")),
         "test/00.csv | line 1, column 'time' | did you mean 'tme'?"),
     "time and dt in ms": (_both(_rig("dt = 0.01", "dt = 10"), _everywhere("time", lambda t: 1000 * t)),
@@ -183,8 +147,6 @@ FOLDERS = {  # name: (the change of the folder, the words of the message, the fi
     "test in train": (_cut(0, 201), "test file 01.csv | same content as train file 01.csv | remove one"),
     "a part of train in test": (_cut(100, 150),
         "test file 01.csv | row 1 and those after it are also in train file 01.csv, from row 101 | remove one"),
-    "a sequence twice": (lambda f: shutil.copy(f / "train/01.csv", f / "train/02.csv"),
-        "train file 02.csv | same content as train file 01.csv | remove one"),
 }  # fmt: skip
 ERRORS = FOLDERS | {name: (_log_file(change), f"train/01.csv | {words}") for name, (change, words) in LOGS.items()}
 
@@ -196,23 +158,18 @@ def _lost(log):
 WARNINGS = {  # what may be meant: name: (the change of the folder, the words of the warning)
     "gap": (_log_file(lambda s: s.replace(s.splitlines()[6] + "\n", "")),
         "line 7, column 'time' | a gap: 0.04 s, then 0.06 s (1 row missing in all) | inputs there are interpolated"),
-    "gap in noisy inputs": (
-        _log_file(lambda _: csv_text(_lost(swing()) | {"u": np.random.default_rng(0).normal(0.0, 0.1, 191)})),
-        "line 102, column 'time' | a gap: 0.99 s, then 1.1 s (91 rows after it in all) | cannot be interpolated"),
+    "long gap": (_log_file(lambda _: csv_text(_lost(swing()))),
+        "line 102, column 'time' | a gap: 0.99 s, then 1.1 s (91 rows after it in all) | nnap-em import"),
     "spike": (_log_file(with_field(50, "theta1", "0.5")),
         "line 50, column 'theta1' | reading far from what the readings before and after say (spike) | first at 0.48"),
     "stuck": (_log_file(_column("theta1", lambda x: np.where(np.arange(x.size) // 40 == 2, x[80], x))),
         "line 83, column 'theta1' | 39 readings one value over again while the machine moves (stuck)"),
     "late sensor": (_log_file(_column("dtheta1", lambda x: np.where(np.arange(x.size) < 30, 0.0, x))),
         "line 2, column 'dtheta1' | 30 readings one value over again until the sensor starts (late start)"),
-    "saturated": (_log_file(_column("dtheta1", lambda x: np.maximum(x, -5.0))),
-        "column 'dtheta1' | at the end of the sensor's range while the machine goes beyond (saturated)"),
     "constant": (_log_file(_column("theta1", lambda x: 0 * x + 0.25)),
         "train/01.csv | column 'theta1' | constant at 0.25 | is the sensor alive?"),
     "degrees without a rate": (_both(_only("theta1"), _log_file(_column("theta1", np.degrees))),
         "train/01.csv | column 'theta1' | turns at | is it in degrees?"),
-    "degrees/s without an angle": (_both(_only("dtheta1"), _log_file(_column("dtheta1", np.degrees))),
-        "train/01.csv | column 'dtheta1' | turns at | is it in degrees?"),
     "another scale": (_log_file(_column("dtheta1", lambda x: 1.6 * x)),
         "train/01.csv | column 'dtheta1' | 0.625 times | check units"),
     "another motion": (_log_file(_column("dtheta1", lambda x: np.sin(np.arange(x.size) / 11))),
@@ -222,7 +179,6 @@ WARNINGS = {  # what may be meant: name: (the change of the folder, the words of
     "input in N mm": (_everywhere("u", lambda x: 1e4 * x),
         "train: column u | gravity and inertia of joint 1 | look at its unit (N m)"),
     "mass in g": (_rig("m = 0.5", "m = 500e3"), "train: column u |  need  | masses (kg)"),
-    "gravity in mm/s^2": (_rig("g = 9.81", "g = 9810"), "rig.toml | [model] g | 9810 | write it in m/s^2"),
     "length in mm": (_rig("lc = 0.4", "lc = 400"), "rig.toml | [model] lc | 400 | write it in m"),
 }  # fmt: skip
 
@@ -269,7 +225,7 @@ def _no_number(text: str) -> bool:
         return bool(text.strip())  # an empty field is a missing sample
 
 
-_corrupt = st.sampled_from(["x", "-inf", "1e999", "--1", "0x10", "1_0", "1;5", "true", "1 2", "=A1"])
+_corrupt = st.sampled_from(["x", "-inf", "1e999", "--1", "0x10", "1_0", "1;5", "1 2", "=A1"])
 
 
 @settings(deadline=None, max_examples=60)  # it writes files

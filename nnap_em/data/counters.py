@@ -32,11 +32,10 @@ class Counter(NamedTuple):
         return f"jumps by {self.size:.4g}"
 
 
-def counter(y: Float[np.ndarray, " time"], *, angle: bool = False, rate: bool = False) -> Counter | None:
+def counter(y: Float[np.ndarray, " time"], *, angle: bool = False) -> Counter | None:
     """The jumps of a column; None where there are none of one size.
 
-    Those of an `angle` by a turn may begin and end anywhere: a driver that has counted turns may lose one.  A `rate`
-    is a counter only where it was read without its sign, as one of so many bits: other jumps are kicks.
+    Those of an `angle` by a turn may begin and end anywhere: a driver that has counted turns may lose one.
     """
     k = np.flatnonzero(np.isfinite(y))
     x, step = y[k], np.diff(y[k])
@@ -45,8 +44,7 @@ def counter(y: Float[np.ndarray, " time"], *, angle: bool = False, rate: bool = 
     quantum, few = float(np.min(np.diff(np.unique(x)))), 0.15  # of a turn, by which a jump may miss it
     size = _size(k, x, quantum)
     lost = [turn for turn in _TURNS if np.any((np.abs(np.abs(step) - turn) < few * turn) & (np.diff(k) <= 2))]
-    unsigned = size > 0 and 0 <= np.min(x) < 0.1 * size and math.log2(size / quantum) % 1 == 0
-    if not _runs_on(x, size, jumps) or (rate and not unsigned):
+    if not _runs_on(x, size, jumps):
         size = next((turn for turn in lost if angle and np.median(np.abs(step)) < 0.1 * turn), 0.0)
     levels = 32  # steps of the sensor that a counter has at least: an encoder at rest may go to and fro between two
     if size < levels * quantum:
@@ -56,26 +54,22 @@ def counter(y: Float[np.ndarray, " time"], *, angle: bool = False, rate: bool = 
     return Counter(size, turns[last], k[1:][np.diff(turns) != 0])
 
 
-def unwrapped(y: Float[np.ndarray, " time"], found: Counter, *, rate: bool = False) -> Float[np.ndarray, " time"]:
-    """The readings without the jumps: the first stays, and of a `rate`, whose zero is known, the median is near 0."""
-    out = y + found.size * found.turns
-    return out - found.size * round(float(np.nanmedian(out)) / found.size) if rate else out
-
-
 def _size(k: Int[np.ndarray, " seen"], x: Float[np.ndarray, " seen"], quantum: float) -> float:
-    """Median size of the jumps, each by a cubic and jumps through the eight readings around it.
+    """Median size of the jumps beside the steps that the two before and after each give by a cubic.
 
     Within its error it is a power of two or a number of the sensor's steps, or a part of a turn.
     """
-    size = float(np.ptp(x))
-    turns, sizes = np.round((np.unwrap(x, period=size) - x) / size), []
-    for i in (np.flatnonzero(np.diff(turns)) + 1)[:_PARTS]:
-        rows = slice(max(i - 4, 0), i + 4)
-        base = np.vander((k[rows] - k[i]) / 8, 4)
-        sizes.append(-np.linalg.lstsq(np.column_stack([base, turns[rows]]), x[rows], rcond=None)[0][-1])
-    if not sizes or (size := float(np.median(sizes))) <= 0:
+    step, rows = np.diff(x), np.diff(k)
+    turns = np.round(step / np.ptp(x))
+    speed = (step - np.ptp(x) * turns) / rows
+    at = np.flatnonzero(turns[2:-2]) + 2
+    if not at.size:
         return 0.0
-    error = 12 * reading_noise((x + size * turns)[None]) / math.sqrt(len(sizes))
+    expected = rows[at] * (4 * (speed[at - 1] + speed[at + 1]) - speed[at - 2] - speed[at + 2]) / 6
+    size = float(np.median((step[at] - expected) / turns[at]))
+    if size <= 0:
+        return 0.0
+    error = max(12 * reading_noise(np.unwrap(x, period=size)[None]) / math.sqrt(at.size), 1e-3 * size)
     parts = [turn / min(max(round(turn / size), 1), _PARTS) for turn in _TURNS]
     exact = (quantum * 2.0 ** round(math.log2(size / quantum)), *parts, quantum * round(size / quantum))
     return next((one for one in exact if abs(one - size) <= error), size)

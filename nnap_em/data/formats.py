@@ -3,12 +3,12 @@
 import codecs
 import csv
 import difflib
+import functools
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple, NoReturn
 
@@ -24,8 +24,6 @@ from .mat_structs import mat_columns
 from .rig import nearest
 from .units import is_time
 
-LARGEST_FILE = 256 * 2**20  # bytes of the file of one sequence: some million rows
-BLOCK = 20_000  # rows whose fields are split at once, which take some 40 times the memory of their text
 PLAIN = (",", ".")
 """Marks of columns and of decimals in the CSV files of a data set."""
 Table = Float[np.ndarray, "time column"]
@@ -38,16 +36,13 @@ def has_logs(folder: Path) -> bool:
 
 
 def log_files(folder: Path) -> list[Path]:
-    """The logs of a folder by name; DataError where there is none, or two for one sequence."""
+    """The logs of a folder by name; DataError where there is none."""
     files = _logs(folder)
     if not files:
         every = sorted(path for path in folder.glob("*") if not path.name.startswith("."))
         problem = "holds no *.csv (nor *.parquet, *.mat)" if folder.is_dir() else "is no folder"
         others = f"; found there: {', '.join(path.name for path in every[:3])}" if every else ""
         raise DataError(f"{folder}: {problem}{others}; put one CSV file per sequence there")
-    for one, two in pairwise(sorted(files, key=lambda path: (path.stem, path.name))):
-        if one.stem == two.stem:
-            raise DataError(f"{two}: there is a {one.name} beside it, maybe of the same sequence; remove or rename one")
     return files
 
 
@@ -175,48 +170,38 @@ class TextTable:
     """Line of the file in which the first row stands, from 1."""
     marks: tuple[str, str] = PLAIN
     """Marks of columns and of decimals."""
-    exact: bool = True
-    """Each row has a field for each name; otherwise the last ones may be absent, and TRUE is 1."""
-
-    def fields(self, start: int = 0, end: int | None = None) -> list[list[str]]:
-        """The fields of rows, as many as there are names."""
-        width, out = len(self.names), []
-        for at, line in enumerate(self.lines[start:end], self.first + start):
-            row = split(line, self.marks[0])
-            if not self.exact:
-                row = trimmed(truths(row))
-                row += [""] * (width - len(row))
-            if len(row) != width:
-                hint = "separate columns by ',', write decimals with '.', give every column a field"
-                hint = _separator_hint(line, line) or f"{hint}; line 1 is the header"
-                other = "name every column; mark columns and decimals differently"
-                problem = f"found {counted(len(row), 'field')} under {counted(width, 'name')}"
-                refuse(self.path, f"line {at}", problem, hint if self.exact else other)
-            if self.exact and at == 2 and not any(map(_is_number, row)):
-                hint = header_hint(self.path) or "remove the row of units"
-                refuse(self.path, "line 2", f"holds no number, found {','.join(row)!r}", hint)
-            out.append(row)
-        return out
 
     @cached_property
     def values(self) -> Table:
         """Numbers of all fields: NaN where one is empty, infinite where it is a text."""
-        starts = range(0, len(self.lines), BLOCK)
-        return np.concatenate([self._block(start, start + BLOCK) for start in starts])
-
-    def _block(self, start: int, end: int) -> Table:
-        lines, (mark, decimal) = self.lines[start:end], self.marks
+        (mark, decimal), shape = self.marks, (len(self.lines), len(self.names))
+        read = functools.partial(np.loadtxt, self.lines, delimiter=mark or None, comments=None, ndmin=2)
         with suppress(ValueError):  # at full speed, where all of them are finite numbers
-            table = np.loadtxt(lines, delimiter=mark or None, comments=None, ndmin=2)
-            if decimal == "." and table.shape == (len(lines), len(self.names)) and np.isfinite(table).all():
+            table = read()
+            if decimal == "." and table.shape == shape and np.isfinite(table).all():
                 return table
-        columns = zip(*self.fields(start, end), strict=True)
-        return np.array([_numbers(texts, decimal) for texts in columns]).T
+        try:
+            table = read(converters=lambda text: number(text, decimal), quotechar='"')
+        except ValueError:  # rows of different lengths
+            table = np.zeros((0, 0))
+        if table.shape == shape and self.first == 2 and np.isinf(table[0]).all():
+            hint = header_hint(self.path) or "remove the row of units"
+            refuse(self.path, "line 2", f"holds no number, found {self.lines[0]!r}", hint)
+        if table.shape == shape:
+            return table
+        counts = (len(split(line, mark)) for line in self.lines)
+        at, count = next(((at, n) for at, n in enumerate(counts, self.first) if n != shape[1]), (self.first, 0))
+        hint = _separator_hint(*2 * [self.lines[at - self.first]])
+        hint = (
+            hint or "separate columns by ',', write decimals with '.', give every column a field; line 1 is the header"
+        )
+        problem = f"found {counted(count, 'field')} under {counted(shape[1], 'name')}"
+        return refuse(self.path, f"line {at}", problem, hint)
 
     def texts(self, name: str, rows: Rows = slice(None)) -> list[str]:
         """The fields of one column."""
         i = self.names.index(name)
-        return [self.fields(k, k + 1)[0][i] for k in np.arange(len(self.lines))[rows].tolist()]
+        return [split(self.lines[k], self.marks[0])[i] for k in np.arange(len(self.lines))[rows].tolist()]
 
     def column(self, name: str, *, gaps: bool = False, dates: bool = False, rows: Rows = slice(None)) -> np.ndarray:
         """One column as finite numbers, or NaN where `gaps` allow that; as seconds where it has dates."""
@@ -339,17 +324,6 @@ def _damaged(path: Path) -> Iterator[None]:
         raise DataError(f"{path}: no {form} file, or damaged or cut short; {hint}") from None
 
 
-def check_size(path: Path) -> None:
-    """Raise DataError where a file cannot be read, or is too large to be one sequence."""
-    try:
-        size = path.stat().st_size
-    except OSError as error:
-        raise unreadable(path, error) from None
-    if size > LARGEST_FILE:
-        hint = f"cut it into sequences of some seconds, at most {LARGEST_FILE // 2**20} MB a file"
-        raise DataError(f"{path}: {size / 2**20:.0f} MB are too much for one sequence; {hint}")
-
-
 def unreadable(path: Path, error: OSError) -> DataError:
     """The error of a file that the system does not give."""
     return DataError(f"{path}: cannot be read ({error.strerror}); check the path and the rights")
@@ -365,26 +339,14 @@ def read_bytes(path: Path, most: int = -1) -> bytes:
 
 
 def number(text: str, decimal: str = ".") -> float:
-    """A number; NaN for an empty field, infinite for another text."""
+    """A number, or a truth value of a PLC; NaN for an empty field, infinite for another text."""
+    text = text.strip()
     if decimal == ",":
         text = text.replace(".", "?").replace(",", ".")
     try:
         return float(text or "nan") if "_" not in text else math.inf  # Python takes 1_0 for 10
     except ValueError:
-        return math.inf
-
-
-def _numbers(texts: Sequence[str], decimal: str) -> list[float]:
-    """The numbers of fields, the faster where all are numbers or empty."""
-    with suppress(ValueError):
-        if decimal == "." and "_" not in "".join(texts):
-            return [float(text) if text else math.nan for text in texts]
-    return [number(text, decimal) for text in texts]
-
-
-def truths(row: Sequence[str]) -> list[str]:
-    """Fields with the truth values of a PLC as numbers."""
-    return [{"TRUE": "1", "FALSE": "0"}.get(text.upper(), text) for text in row]
+        return {"TRUE": 1.0, "FALSE": 0.0}.get(text.upper(), math.inf)
 
 
 def trimmed(row: Sequence[str]) -> list[str]:
@@ -394,7 +356,7 @@ def trimmed(row: Sequence[str]) -> list[str]:
 
 def _is_number(field: str) -> bool:
     """True for a number and for an empty field."""
-    return not math.isinf(number(field.strip()))
+    return not math.isinf(number(field))
 
 
 def _separator_hint(first: str, last: str) -> str | None:

@@ -12,16 +12,16 @@ from jaxtyping import Float, Int
 
 from ..numerics.digits import counted
 from .dataset import DataError, Dataset, pad
-from .formats import check_size, columns_of, header_hint, log_files, place, refuse, table_of, untimed
+from .formats import columns_of, header_hint, log_files, place, refuse, table_of, untimed
 from .held import hold
 from .held import repeats as held_rows
-from .missing import interpolated
 from .plausible import Columns, implausible, repeats
 from .rig import Rig
-from .rough import FULL, Rough, rough
+from .rough import Rough, rough
 from .units import is_episode, other_unit
 
 TOLERANCE = 0.01  # of the declared dt, for every interval
+LOST = 2  # rows that follow each other over which inputs are interpolated
 OTHER_UNIT = 100.0  # times the declared value of a column that scales a servo: V beside mV, and no gain changes so much
 REPEAT, RANGE = "held", "range"
 _Parts = tuple[np.ndarray, np.ndarray, np.ndarray]
@@ -109,9 +109,6 @@ def read_logs(folder: Path | str, rig: Rig, *, trust: bool = False, until: float
         tables = [_without(table, REPEAT, rows, rig) for table, rows in zip(tables, again, strict=True)]
         early = [table.readings(rig, until) for table in tables]
     entries = [[] if trust else rough(readings, rig.dt) for readings in early]
-    found = ((each, readings) for readings, entry in zip(early, entries, strict=True) for each in entry)
-    full = {(each.column, y) for each, readings in found if each.kind == FULL for y in readings[each.column][each.rows]}
-    entries = [rough(readings, rig.dt, full) for readings in early] if full else entries
     sequences = [_sequence(table, each, rig) for table, each in zip(tables, entries, strict=True)]
     data, masked = pad([used for used, _, _ in sequences]), tuple(m for *_, each in sequences for m in each)
     unmasked = pad([as_read for _, as_read, _ in sequences]) if masked else None
@@ -235,7 +232,6 @@ def _masked(source: _Table, kind: str, column: str, rows: Int[np.ndarray, " row"
 
 
 def _read_table(path: Path, rig: Rig) -> _Table:
-    check_size(path)
     content = table_of(path)
     clock = ("time",) if "time" in content.names or header_hint(path) or untimed(content.names) else ()
     table = columns_of(content, (*clock, *rig.logged_inputs), rig.measured)
@@ -273,8 +269,7 @@ def _sequence(source: _Table, entries: Sequence[Rough], rig: Rig) -> tuple[_Part
     y = read.copy()
     for entry in entries:
         y[entry.rows, rig.measured.index(entry.column)] = np.nan
-    inputs, readings = dict(zip(rig.logged_inputs, u.T, strict=True)), dict(zip(rig.measured, y.T, strict=True))
-    for finding in implausible(inputs, readings, rig.dt, rig.unit, rig.pairs()):
+    for finding in implausible(dict(zip(rig.measured, y.T, strict=True)), rig.dt, rig.unit, rig.pairs()):
         where = place(path, finding.column, None if finding.row is None else int(line[finding.row]))
         if finding.ruins:
             refuse(path, where, finding.problem, finding.hint)
@@ -308,23 +303,21 @@ def _rows(path: Path, t: Float[np.ndarray, " time"], rig: Rig) -> Int[np.ndarray
 
 
 def _whole(path: Path, table: Float[np.ndarray, "row column"], rows: Int[np.ndarray, " row"], rig: Rig) -> _Table:
-    """The rows that the file lost, without readings; cut at the first gap where inputs cannot be interpolated."""
-    size, inputs = int(rows[-1]) + 1, slice(1, 1 + len(rig.logged_inputs))
+    """The rows that the file lost, without readings; cut at the first gap of more than `LOST` rows."""
+    size = int(rows[-1]) + 1
     if size == len(rows):
         return _Table(path, table, rows, [])
+    missing = ~np.isin(np.arange(size), rows)
     full = np.full((size, table.shape[1]), np.nan)
     full[rows] = table
-    missing = np.isnan(full[:, 0])
-    full[:, 0] = np.interp(np.arange(size), rows, table[:, 0])
-    filled = [interpolated(u, missing) for u in full[:, inputs].T]
-    full[:, inputs] = np.stack([u for u, _ in filled], axis=1) if filled else full[:, inputs]
-    allowed = 0.1  # of the impulse of one row: allowed error of inputs interpolated over a gap
-    dark = np.any([error > allowed for _, error in filled], axis=0) if filled else np.zeros(size, bool)
-    end = int(np.argmax(dark)) if dark.any() else size
+    for column in range(1 + len(rig.logged_inputs)):
+        full[:, column] = np.interp(np.arange(size), rows, table[:, column])
+    long = np.flatnonzero((np.diff(rows) > 1 + LOST) & bool(rig.logged_inputs))
+    end = int(rows[long[0]]) + 1 if long.size else size
     used, masked = rows[rows < end], []
     for first, count, kind, hint in (
-        (int(missing.argmax()), int(missing[:end].sum()), "gap", "inputs there are interpolated from the rows around"),
-        (end, len(rows) - len(used), "cut", "inputs before these rows cannot be interpolated: not used"),
+        (int(missing.argmax()), int(missing[:end].sum()), "gap", "inputs there are interpolated"),
+        (end, len(rows) - len(used), "cut", "not used; `nnap-em import` makes sequences of what lies between gaps"),
     ):
         if count:
             k = int(np.searchsorted(rows, first))  # the row of the file after the gap

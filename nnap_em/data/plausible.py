@@ -52,11 +52,7 @@ class Repeat(NamedTuple):
 
 
 def implausible(
-    inputs: Columns,
-    readings: Columns,
-    dt: float,
-    unit: Callable[[str], str],
-    pairs: Sequence[tuple[str, str]],
+    readings: Columns, dt: float, unit: Callable[[str], str], pairs: Sequence[tuple[str, str]]
 ) -> Iterator[Implausible]:
     """Implausible parts of the columns of one sequence, sampled every `dt` [s]; `pairs` are coordinates and rates."""
     for name, values in readings.items():
@@ -68,11 +64,10 @@ def implausible(
         if observed.size > 1 and np.ptp(observed) == 0:
             yield Implausible(False, name, None, f"constant at {observed[0]:g}", "is the sensor alive?")
     for name, values in readings.items():
-        if unit(name) in ("rad", "m", "rad/s", "m/s"):
-            yield from _wrapped(name, values, unit(name))
-    yield from _copies(inputs, readings)
+        if unit(name) in ("rad", "m"):
+            yield from _wrapped(name, values, unit(name) == "rad")
     for name, rate in pairs:
-        yield from _pair(name, rate, {**inputs, **readings}, dt, unit(name) == "rad")
+        yield from _pair(name, rate, readings, dt, unit(name) == "rad")
     fastest = 30.0  # rad/s, as the median speed of a joint
     for name, values in readings.items():
         rate = unit(name) == "rad/s"
@@ -83,19 +78,12 @@ def implausible(
 def repeats(sequences: Columns | Mapping[str, Float[np.ndarray, "time column"]]) -> Iterator[Repeat]:
     """The first stretch of each sequence that an earlier one holds too; standstill is no copy."""
     seen: dict[bytes, tuple[str, int]] = {}
-    sequences_seen: dict[bytes, str] = {}
     for name, rows in sequences.items():
-        rows = np.asarray(rows) + 0.0  # no -0
-        stretches = dict(_stretches(rows))
-        everything = rows.tobytes() if stretches else None
-        if everything in sequences_seen:
-            yield Repeat(name, 0, sequences_seen[everything], 0, True)
-        elif same := next((content for content in stretches if content in seen), None):
-            yield Repeat(name, stretches[same], *seen[same], False)
-        for content, row in stretches.items():
-            seen.setdefault(content, (name, row))
-        if everything:
-            sequences_seen.setdefault(everything, name)
+        stretches = dict(_stretches(np.asarray(rows) + 0.0))  # no -0
+        if same := next((content for content in stretches if content in seen), None):
+            other, there = seen[same]
+            yield Repeat(name, stretches[same], other, there, np.array_equal(rows, sequences[other], equal_nan=True))
+        seen = {content: (name, row) for content, row in stretches.items()} | seen
 
 
 def bridge(values: Float[np.ndarray, " time"]) -> Float[np.ndarray, " time"]:
@@ -114,16 +102,6 @@ def _stretches(rows: Float[np.ndarray, "time column"]) -> Iterator[tuple[bytes, 
             yield np.ascontiguousarray(rows[k : k + length]).tobytes(), k
 
 
-def _copies(inputs: Columns, readings: Columns) -> Iterator[Implausible]:
-    """A reading that is another column over again."""
-    columns = [*inputs.items(), *readings.items()]
-    for i, (name, values) in enumerate(columns[len(inputs) :], len(inputs)):
-        for other, others in columns[:i]:
-            if np.nanmax(values) > np.nanmin(values) and np.array_equal(values, others, equal_nan=True):
-                problem = f"the same numbers as column {other!r}"
-                yield Implausible(True, name, None, problem, "write what each sensor reads, or take the column out")
-
-
 def _pair(name: str, rate: str, columns: Columns, dt: float, angle: bool) -> Iterator[Implausible]:
     """A coordinate against the integral of its rate: units, sign, and what is swapped."""
     fit, ratio = _follows(columns[name], columns[rate], dt)
@@ -140,16 +118,11 @@ def _pair(name: str, rate: str, columns: Columns, dt: float, angle: bool) -> Ite
         problem = f"the rate of {name!r} is minus column {rate!r}"
         yield Implausible(True, rate, None, problem, "turn the sign of the wrong one: both count in the same direction")
     elif fit < 0.5:
-        for one, two, wrong, other in (
-            (rate, name, name, rate),
-            *((other, rate, name, other) for other in columns if other not in (name, rate)),
-            *((name, other, rate, other) for other in columns if other not in (name, rate)),
-        ):
-            fit, ratio = _follows(columns[one], columns[two], dt)
-            if fit > 0.95 and 0.8 < ratio < 1.25:
-                problem = f"{two!r} is the rate of {one!r}"
-                yield Implausible(True, wrong, None, problem, f"swap the names {wrong!r} and {other!r}")
-                return
+        fit, ratio = _follows(columns[rate], columns[name], dt)
+        if fit > 0.95 and 0.8 < ratio < 1.25:
+            problem = f"{name!r} is the rate of {rate!r}"
+            yield Implausible(True, name, None, problem, f"swap the names {name!r} and {rate!r}")
+            return
         if _moves(columns[name]) and _moves(columns[rate]):
             yield Implausible(False, rate, None, f"it is not the rate of {name!r}", f"check {ways}")
 
@@ -176,14 +149,13 @@ def _advance(values: Float[np.ndarray, " time"], dt: float) -> Float[np.ndarray,
     return values[span:] - values[:-span]
 
 
-def _wrapped(name: str, values: Float[np.ndarray, " time"], unit: str) -> Iterator[Implausible]:
+def _wrapped(name: str, values: Float[np.ndarray, " time"], angle: bool) -> Iterator[Implausible]:
     """Jumps of a counter that starts over."""
-    rate = unit.endswith("/s")
-    found = counter(values, angle=unit == "rad", rate=rate)
+    found = counter(values, angle=angle)
     if found is not None:
         row = int(found.rows[0])
         hint = f"take the jumps out: nnap-em import LOG ... --rig rig.toml --out NEW --unwrap {shlex.quote(name)}"
-        hint += " (and convert degrees to rad)" if found.size == 360.0 and not rate else ""
+        hint += " (and convert degrees to rad)" if found.size == 360.0 else ""
         problem = f"{found}, in {counted(found.rows.size, 'place')}, here to {values[row]:.6g}"
         yield Implausible(True, name, row, problem, hint)
 

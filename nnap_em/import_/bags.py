@@ -15,7 +15,7 @@ from jaxtyping import Float, Int
 
 from ..data.dataset import DataError
 from ..data.formats import refuse, unreadable
-from .clock import choose
+from .clock import Messages, choose
 from .objects import flatten, pick
 from .recording import EXTRA, OTHER, Recording, Topic
 
@@ -99,15 +99,14 @@ def read(path: Path, fields: Mapping[str, Sequence[str]]) -> Recording:
             times[topic].append(t)
             for at, values in columns[topic].items():
                 values.append(pick(message, at))
-        tracks = {}
+        messages = {}
         for topic in fields:
             if topic not in times:
                 refuse(path, f"topic {topic!r}", "has no messages", "name another topic, or take the log out")
             values = {at: np.array(y) for at, y in columns[topic].items()}
             stamp = _nanoseconds(*(values[at] for at in stamps[topic]))
-            wanted = {at: values[at] for at in fields[topic]}
-            tracks[topic] = choose(path, topic, np.array(times[topic]), stamp, wanted)
-        return Recording(path, tracks, log.notes)
+            messages[topic] = Messages(np.array(times[topic]), stamp, {at: values[at] for at in fields[topic]})
+        return Recording(path, choose(path, messages), log.notes)
 
 
 def _stamp(fields: Mapping[str, float]) -> tuple[str, ...]:

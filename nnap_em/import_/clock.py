@@ -1,7 +1,8 @@
-"""The times of topics: their order, stamps of other clocks, which clock to take, and one for all of a log."""
+"""The times of topics: their order, stamps of other clocks, and which clock to take."""
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int, Real
@@ -10,31 +11,44 @@ from ..data.dataset import Array
 from ..data.formats import refuse
 from ..data.units import UNITS
 from ..numerics.digits import counted
-from .recording import SECOND, Lag, Recording, Track
+from .recording import SECOND, Track
 
 BACK = 1.0
 """Seconds that a log may be out of order: writers of several threads are, a clock that was set back is more."""
+LATENCY = 0.25
+"""Longest latency of a recorder [s]: stamps further behind the log times are of another clock."""
 Values = Mapping[str, Float[np.ndarray, " message"]]
 
 
-def choose(
-    path: Path, topic: str, log: Int[np.ndarray, " message"], stamp: Int[np.ndarray, " message"] | None, values: Values
-) -> Track:
-    """Columns at header stamps where they are there, rise and are of the log's clock; at log times otherwise [ns].
+class Messages(NamedTuple):
+    """Log times and stamps of the messages of a topic [ns], and their numbers."""
 
+    log: Int[np.ndarray, " message"]
+    stamp: Int[np.ndarray, " message"] | None
+    values: Values
+
+
+def choose(path: Path, topics: Mapping[str, Messages]) -> dict[str, Track]:
+    """Columns at header stamps where these are there and rise, at log times otherwise [ns].
+
+    The stamps of a log are of one clock, and log times the same but for a latency: where the medians of their
+    difference, in the first and last fifth of each topic, are further apart than 0.25 s, all topics are at log times.
     Raises DataError where there is no time at all, or it runs backwards.
     """
-    notes: tuple[str, ...] = ()
-    if stamp is not None:
-        order = np.argsort(log, kind="stable")
-        used = order[trusted(stamp[order])]
-        reason = _odd(stamp[used], log[used])
-        if reason is None:
-            track = _track(stamp, used, values, "header stamp", "message")
-            return track._replace(lag=lags(stamp[used], log[used]))
-        notes = (f"header stamps {reason}: log times are taken",)
-    track = rising(path, f"topic {topic!r}", log, values, "log time", "message")
-    return track._replace(notes=notes + track.notes, lag=((int(log[0]), 0),))
+    late = {topic: _late(*each[:2]) for topic, each in topics.items()}
+    apart = float(np.ptp([(0.0, 0.0) if isinstance(each, str) else each for each in late.values()]))
+    far = f"are of another clock, {apart:.4g} s from that of the log or of another topic"
+    tracks = {}
+    for topic, (log, stamp, values) in topics.items():
+        where, each = f"topic {topic!r}", late[topic]
+        if stamp is not None and not isinstance(each, str) and apart <= LATENCY:
+            track = rising(path, where, stamp, values, "header stamp", "message")
+            tracks[topic] = track._replace(late=float(np.mean(each)))
+            continue
+        why = each if isinstance(each, str) else far
+        track = rising(path, where, log, values, "log time", "message")
+        tracks[topic] = track._replace(notes=(*[f"header stamps {why}: log times are taken"] * bool(why), *track.notes))
+    return tracks
 
 
 def rising(
@@ -108,55 +122,6 @@ def trusted(t: Int[np.ndarray, " message"]) -> Int[np.ndarray, " kept"]:
     return np.sort(order[~few[group]])
 
 
-def lags(stamp: Int[np.ndarray, " message"], log: Int[np.ndarray, " message"]) -> Lag:
-    """Median of stamp minus log time in parts of a topic, at the median stamp of each [ns]."""
-    most = 20  # parts of a topic for each of which its stamps are compared with the log times
-    least = 50  # messages of such a part at least, so that its median is no chance
-    parts = np.array_split(np.arange(stamp.size), min(max(stamp.size // least, 1), most))
-    return tuple((int(np.median(stamp[k])), int(np.median(stamp[k] - log[k]))) for k in parts)
-
-
-def on_one_clock(recording: Recording, dt: float, shifted: Collection[str]) -> Recording:
-    """The recording with its topics on the clock of the log, where their clocks differ by what is no latency.
-
-    A stamp is behind the log time of its message by the latency of the recorder: never ahead of it, by no more than
-    0.25 s, and by the same at the end as at the start, to a row each.  Within this, a difference of more than a row is
-    reported, save for topics in `shifted`.
-    """
-    lag_of = {topic: np.array(track.lag, float).T for topic, track in recording.tracks.items() if track.lag}
-    clocks = {track.clock for track in recording.tracks.values() if not track.lag}
-    if len(clocks) > 1:
-        names = " and ".join(repr(name) for name in sorted(clocks))
-        return recording._replace(notes=(*recording.notes, f"times are of {names}: are these of one clock?"))
-    if len(lag_of) < 2:
-        return recording
-    at = np.unique(np.concatenate([stamps for stamps, _ in lag_of.values()]))
-    behind = {topic: -1e-9 * np.interp(at, *lag) for topic, lag in lag_of.items()}
-    late = np.stack([*behind.values()])
-    apart = late.max(0) - late.min(0)
-    if apart.max() <= dt:
-        return recording
-    words = {
-        topic: f"{topic} are {abs(np.median(each)):.3f} s {'behind' if np.median(each) > 0 else 'ahead of'}"
-        for topic, each in behind.items()
-        if np.abs(each).max() > dt
-    }
-    note = f"header stamps of {', those of '.join(words.values())} the clock of the log"
-    latency = 0.25  # longest one of a recorder [s]: stamps that are more behind the log times are of another clock
-    if late.min() < -dt or late.max() > latency or np.ptp(apart) > dt:
-        tracks = dict(recording.tracks)
-        for topic in words:
-            t = tracks[topic].t
-            tracks[topic] = tracks[topic]._replace(t=t - np.round(np.interp(t, *lag_of[topic])).astype(np.int64))
-        note += ": taken out, all topics are on the clock of the log"
-        return recording._replace(tracks=tracks, notes=(*recording.notes, note))
-    if set(words) <= set(shifted):
-        return recording
-    hint = ", ".join(f"--shift {topic}={np.median(behind[topic]):.3g}" for topic in words)
-    note += f", not those of other topics: where this is no latency, {hint} takes it out"
-    return recording._replace(notes=(*recording.notes, note))
-
-
 def _track(t: Int[np.ndarray, " m"], order: Int[np.ndarray, " used"], values: Values, name: str, noun: str) -> Track:
     """The last number of each column at each time, NaN where none has one; notes about messages moved or left out."""
     notes: list[str] = []
@@ -183,16 +148,15 @@ def _track(t: Int[np.ndarray, " m"], order: Int[np.ndarray, " used"], values: Va
     return Track(t[first], columns, name, tuple(notes))
 
 
-def _odd(stamp: Int[np.ndarray, " message"], log: Int[np.ndarray, " message"]) -> str | None:
-    """Reason why stamps are no clock."""
-    if stamp.max() == stamp.min():
-        return "are all the same" if stamp[0] else "are all 0"
-    back = np.flatnonzero(np.diff(stamp) < 0)
-    if back.size:
-        return f"run backwards ({back.size} times)"
-    offset = float(np.median(np.abs(stamp - log))) * 1e-9
-    if offset > 10.0:  # seconds between stamp and log time from which on they are those of two clocks
-        return f"are of another clock, {offset:.4g} s from that of the log"
-    knots = np.array(lags(stamp, log), dtype=float)
-    set_ = np.abs(np.diff(knots[:, 1])) > 0.5 * np.diff(knots[:, 0])
-    return "were set within the log" if set_.any() else None
+def _late(log: Int[np.ndarray, " message"], stamp: Int[np.ndarray, " message"] | None) -> tuple[float, float] | str:
+    """Medians of log time minus stamp in the first and last fifth of the messages [s], or why stamps are no clock."""
+    if stamp is None:
+        return ""
+    used = stamp[np.argsort(log, kind="stable")]
+    used = used[trusted(used)]
+    if used.max() == used.min():
+        return "are all the same" if used[0] else "are all 0"
+    if back := int(np.sum(np.diff(used) < 0)):
+        return f"run backwards ({back} times)"
+    late, part = (log - stamp) * 1e-9, log.size // 5 + 1
+    return float(np.median(late[:part])), float(np.median(late[-part:]))

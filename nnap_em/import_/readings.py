@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..data.counters import Counter, counter, unwrapped
+from ..data.counters import Counter, counter
 from ..data.held import hold, repeats
 from ..data.rig import Rig
 from ..data.rough import spikes
@@ -28,14 +28,14 @@ def as_taken(
             out[name] = replace(s, t=np.delete(s.t, again), y=np.delete(s.y, again))
             notes.append(f"{name}: each reading stands in {rows:.3g} messages: {again.size} repeats are left out")
     for name in dict.fromkeys((*rig.measured, *unwrap)):
-        s, rate = out[name], rig.unit(name) not in ("rad", "m")
-        found = _jumps(s, rig.unit(name) == "rad", rate)
+        s, unit = out[name], rig.unit(name)
+        found = None if unit.endswith("/s") else _jumps(s, unit == "rad")
         if found is None:
             notes += [f"{name} has no jumps of one size: nothing was unwrapped"] * (name in unwrap)
             continue
         text = f"{name} {found}, in {counted(found.rows.size, 'place')}"
         if name in unwrap:
-            out[name] = replace(s, y=unwrapped(s.y, found, rate=rate))
+            out[name] = replace(s, y=s.y + found.size * found.turns)
             notes.append(f"{text}: unwrapped")
         else:
             out[name] = replace(s, jumps=found.rows)
@@ -43,11 +43,11 @@ def as_taken(
     return out, tuple(notes)
 
 
-def _jumps(s: Signal, angle: bool, rate: bool) -> Counter | None:
+def _jumps(s: Signal, angle: bool) -> Counter | None:
     """The jumps of a signal; where spikes hide them, those of the others."""
-    found = counter(s.y, angle=angle, rate=rate)
+    found = counter(s.y, angle=angle)
     if found is None and np.max(np.abs(np.diff(s.y))) > 0.2 * np.ptp(s.y):
         others = s.y.copy()
         others[spikes(s.y)] = np.nan
-        found = counter(others, angle=angle, rate=rate)
+        found = counter(others, angle=angle)
     return found

@@ -37,10 +37,6 @@ class Topic(NamedTuple):
     """Paths of its numbers, such as `position[shoulder]` or `data[0]`, in the order of the message."""
 
 
-Lag = tuple[tuple[int, int], ...]
-"""Differences of two clocks of a topic over time: (stamp, stamp minus log time) [ns], a few from first to last."""
-
-
 class Track(NamedTuple):
     """Content of one topic."""
 
@@ -52,8 +48,8 @@ class Track(NamedTuple):
     """Source of the times: `header stamp`, `log time`, or the name of a column."""
     notes: tuple[str, ...]
     """Irregularities of the times."""
-    lag: Lag = ()
-    """Difference of this clock from that of the log; empty where the file has one clock only."""
+    late: float = 0.0
+    """Log times minus these times, the median [s]."""
 
 
 class Recording(NamedTuple):

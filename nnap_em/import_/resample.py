@@ -14,7 +14,6 @@ from ..data.formats import refuse
 from ..data.rig import SMOOTH, Rig, nearest
 from ..data.units import other_unit
 from ..numerics.digits import counted
-from .clock import on_one_clock
 from .columns import in_unit, resolve
 from .declared import LONGEST, Plan
 from .files import read, reader
@@ -96,8 +95,7 @@ def resample(path: Path, rig: Rig, plan: Plan, shifts: Mapping[str, float], unwr
         if topic not in (used := sorted({at.topic for at in addresses.values()})):
             raise DataError(f"{path}: --shift {topic}: no topic of that name is used; {nearest(topic, used)}")
     recording = read(path, addresses.values())
-    tracks = {topic: _timed(track, rig.dt) for topic, track in recording.tracks.items()}
-    recording = on_one_clock(recording._replace(tracks=tracks), rig.dt, shifts)
+    recording = recording._replace(tracks={topic: _timed(track, rig.dt) for topic, track in recording.tracks.items()})
     origin = min(int(track.t[0]) for track in recording.tracks.values())
     clocks = {topic: (track.t - origin) * 1e-9 + shifts.get(topic, 0.0) for topic, track in recording.tracks.items()}
     least = {name: 1 if name in rig.logged_inputs else 2 for name in addresses}
@@ -115,7 +113,7 @@ def resample(path: Path, rig: Rig, plan: Plan, shifts: Mapping[str, float], unwr
         rows,
         tuple(stretch for stretch, _ in sequences),
         tuple(columns for stretch, columns in sequences if not stretch.why),
-        (*recording.notes, *units, *notes, *_notes(rig, signals)),
+        (*recording.notes, *units, *notes, *_late(recording.tracks, rig.dt, shifts), *_notes(rig, signals)),
     )
 
 
@@ -244,6 +242,17 @@ def _facts(
         tuple(sorted({gap for s in columns.values() for gap in gaps(s)})),
         track.notes,
     )
+
+
+def _late(tracks: Mapping[str, Track], dt: float, shifts: Collection[str]) -> Iterator[str]:
+    """A message where stamps of topics are behind the log times by different numbers of rows."""
+    late = {topic: track.late for topic, track in tracks.items() if topic not in shifts}
+    if late and max(late.values()) - min(late.values()) > dt:
+        for topic, each in late.items():
+            if abs(each) > dt:
+                side = "behind" if each > 0 else "ahead of"
+                hint = f"where this is no latency, --shift {topic}={each:.3g} takes it out"
+                yield f"stamps of {topic} are {abs(each):.3f} s {side} the log times, not those of others: {hint}"
 
 
 def _notes(rig: Rig, signals: Mapping[str, Signal]) -> Iterator[str]:

@@ -143,9 +143,9 @@ def _parts(path: Path, lines: Sequence[str]) -> Iterator[Block]:
         return
     rows, names = lines[found.first :], _different(found.names)
     end = next((k for k, line in enumerate(rows) if line.strip("\t ,;") == "EOF"), len(rows))
-    table = TextTable(path, names, rows[:end], found.first + 1, found.marks, exact=False)
+    table = TextTable(path, names, _padded(rows[:end], found.marks[0], len(names)), found.first + 1, found.marks)
     if not found.clocks:
-        filled = np.array([k for k, line in enumerate(table.lines) if line.strip()])
+        filled = np.flatnonzero(~np.isnan(table.values).all(axis=1))
         columns = tuple(filter(None, names))
         _refuse_clock(table, untimed(columns) if math.isnan(found.dt) else None)
         yield Block(table, columns, None, rows=filled, dt=found.dt)
@@ -159,6 +159,15 @@ def _parts(path: Path, lines: Sequence[str]) -> Iterator[Block]:
     for clock, *inside in parts.values():
         filled = np.flatnonzero((~np.isnan(table.values[:, [clock, *inside]])).any(axis=1))
         yield Block(table, tuple(names[i] for i in inside), names[clock], day, filled, found.unit)
+
+
+def _padded(lines: Sequence[str], mark: str, width: int) -> list[str]:
+    """Lines with empty fields up to this number, as the last ones may be absent."""
+    short = (line.rstrip().rstrip(mark) if mark else line for line in lines)
+    return [
+        line + (mark or " nan") * (width - 1 - line.count(mark) if mark else width - len(line.split()))
+        for line in short
+    ]
 
 
 def _different(names: Sequence[str]) -> tuple[str, ...]:
@@ -183,5 +192,5 @@ def _codesys(path: Path, lines: Sequence[str]) -> Iterator[Block]:
         elif key == "Flags" and rest and rest[0].isdecimal() and int(rest[0]) & 32:
             unit = "us"
     for name, (first, rows) in parts.items():
-        table = TextTable(path, ("time", name), rows, first, (";", "."), exact=False)
+        table = TextTable(path, ("time", name), rows, first, (";", "."))
         yield Block(table, (name,), "time", unit=unit)

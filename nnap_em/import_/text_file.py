@@ -8,7 +8,7 @@ from itertools import takewhile
 from pathlib import Path
 from typing import NamedTuple
 
-from ..data.formats import PLAIN, number, split, text_lines, trimmed, truths
+from ..data.formats import PLAIN, number, split, text_lines, trimmed
 from ..data.units import clock_of, named_unit
 
 MARKS = (PLAIN, (";", "."), (";", ","), ("\t", "."), ("\t", ","), ("", "."), ("", ","), (",", ","))
@@ -54,7 +54,7 @@ def plain(lines: Sequence[str], found: Layout) -> bool:
 def layout(lines: Sequence[str]) -> Layout | None:
     """The layout that the first lines of a file show; None where no row of numbers stands under names."""
     lines = lines[:200]  # headers have some dozens
-    every = {marks: [[_kind(text, marks[1]) for text in _split(line, marks[0])] for line in lines] for marks in MARKS}
+    every = {marks: [[_kind(text, marks[1]) for text in split(line, marks[0])] for line in lines] for marks in MARKS}
     score = lambda row: row.count(1) - row.count(-1) / 2 if len(row) - row.count(0) > 1 else 0  # noqa: E731
     marks = max(MARKS, key=lambda each: sum(map(score, every[each])))
     kinds, widths = every[marks], Counter(map(len, every[marks]))
@@ -65,8 +65,8 @@ def layout(lines: Sequence[str]) -> Layout | None:
         return len(row) == len(full) and 1 in row and all(a >= 0 or b < 0 for a, b in zip(row, full, strict=True))
 
     first = next((k for k, row in enumerate(kinds) if alike(row)), 0)
-    head = [_split(re.sub(r"^\s*[#%]\s*", "", line), marks[0]) for line in lines[:first]]
-    row = _split(lines[first], marks[0])
+    head = [split(re.sub(r"^\s*[#%]\s*", "", line), marks[0]) for line in lines[:first]]
+    row = split(lines[first], marks[0])
     return next((found for dialect in DIALECTS if (found := dialect(head, row, marks))), None)
 
 
@@ -119,10 +119,6 @@ def _with_units(names: Sequence[str], units: Sequence[str]) -> tuple[str, ...]:
         f"{name} [{unit}]" if name and named_unit(f"{name} [{unit}]")[1] else name
         for name, unit in zip(names, known, strict=False)
     )
-
-
-def _split(line: str, mark: str) -> list[str]:
-    return truths(split(line, mark))
 
 
 def _kind(text: str, decimal: str) -> int:

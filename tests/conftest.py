@@ -48,41 +48,6 @@ def shared() -> Path:
 
 
 @pytest.fixture(scope="session")
-def bench():
-    """A few short sequences of the paper's acrobot, its model, and the smoothed paths."""
-    # not at the top: the types of what is imported before pytest is configured are not checked
-    import equinox as eqx
-
-    from nnap_em.data.rig import Declared, Rig
-    from nnap_em.em.build import build
-    from nnap_em.model.base import prepare
-    from nnap_em.model.simulate import paper_experiment, paper_model
-    from nnap_em.smoother.gaussian import CubatureSmoother
-    from nnap_em.systems.acrobot import table_i
-
-    truth = paper_model()
-    data = paper_experiment(truth, 4, 59, key=jax.random.key(5)).data
-    rig = Rig(
-        "bench",
-        "acrobot",
-        {name: Declared(value, 0.0) for name, value in table_i.items()},
-        True,
-        ("u",),
-        (2,),
-        0.01,
-        "sequence",
-        ("theta1", "dtheta1"),
-        {"theta1": 0.01, "dtheta1": 0.05},
-        {"theta2": Declared(0.0, 0.5), "dtheta1": Declared(0.0, 0.02), "dtheta2": Declared(0.0, 0.02)},
-    )
-    problem = build(rig, data, key=jax.random.key(0))
-    model = eqx.tree_at(lambda m: (m.log_q, m.log_r), problem.model, (truth.log_q + 2.0, truth.log_r))
-    smoother = CubatureSmoother(problem.bank)
-    path = eqx.filter_jit(lambda d: jax.vmap(lambda s: smoother(model, prepare(model, s)))(d))(data).state
-    return rig, model, problem.mstep, data, path
-
-
-@pytest.fixture(scope="session")
 def slide_fit():
     """A fit of `slide_rig()` to `slide_logs(0)`."""
     from rigs import slide_logs, slide_rig

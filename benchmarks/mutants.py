@@ -165,6 +165,15 @@ normal numbers of one sign
 rows of a block left out
 - reshape(count * size, *a.shape[2:])[:length]
 + reshape(count * size, *a.shape[2:])[-length:]
+# numerics/traced.py
+## test_traced.py::test_what_decides_a_program_makes_another[text of the package]
+a kept program whatever the package says now
+- digest(surroundings(), function,
++ digest(function,
+## test_traced.py::test_what_decides_a_program_makes_another[constant]
+a kept program whatever it was made of
+- jax.tree.map(mesh, static), name
++ name
 # numerics/ode.py
 ## test_ode.py::test_linear_system_is_the_taylor_series_to_fourth_order
 weights of the Runge-Kutta stages

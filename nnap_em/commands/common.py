@@ -30,6 +30,7 @@ from ..fit.store import AFTER_FILE, MODEL_FILE, Stored, fingerprint, model_file,
 from ..numerics.digits import counted
 from ..numerics.parallel import use_every_device
 from ..numerics.programs import use_older_emitters
+from ..numerics.traced import use_cache
 from ..report.tables import FRICTION
 from ..storage.files import check_own, cores, sweep
 from ..storage.journal import Journal, keeping
@@ -52,7 +53,7 @@ UNFINISHED = "unfinished"
 
 
 def set_up() -> None:
-    """64-bit numbers, every core, and compiled programs kept for the next call, if there is a place."""
+    """64-bit numbers, every core, and programs kept for the next call, traced and compiled, if there is a place."""
     jax.config.update("jax_enable_x64", True)
     use_older_emitters()
     # Devices made of the cores of one machine at most: sequences are dealt out to them, and there are seldom more
@@ -62,13 +63,18 @@ def set_up() -> None:
             with suppress(RuntimeError):  # JAX runs already: it keeps the devices that it has
                 jax.config.update("jax_num_cpu_devices", min(most_devices, cores()))
         use_every_device()
-    if getattr(jax.config, "jax_compilation_cache_dir", None) is None:
+    folder = getattr(jax.config, "jax_compilation_cache_dir", None)
+    if folder is None:
         folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "nnap_em" / "jax" / _processor()
         with suppress(OSError):
             folder.mkdir(parents=True, exist_ok=True)
-        if os.access(folder, os.W_OK):
-            jax.config.update("jax_compilation_cache_dir", str(folder))
-            jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)  # many small programs
+        if not os.access(folder, os.W_OK):
+            return
+        jax.config.update("jax_compilation_cache_dir", str(folder))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)  # many small programs
+    elif not folder or "JAX_COMPILATION_CACHE_DIR" not in os.environ:  # none, or set in this process, not for commands
+        return
+    use_cache(Path(folder) / "traced")
 
 
 def _processor() -> str:

@@ -4,7 +4,7 @@ import dataclasses
 import functools
 import hashlib
 import importlib.metadata
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, TypeGuard
 
@@ -36,13 +36,17 @@ def parts(node: Any) -> dict[str, Any] | None:
     return None
 
 
-def digest(*trees: Any) -> str:
-    """SHA-256 of all that stands in `trees`; classes and functions count by module and name.
+def full_name(code: Any) -> str:
+    """Module and name of a class or function."""
+    return f"{code.__module__}.{code.__qualname__}"
+
+
+def digest(*trees: Any, name: Callable[[Any], str] = full_name) -> str:
+    """SHA-256 of all that stands in `trees`; classes and functions count by `name`.
 
     Raises TypeError for objects that cannot be distinguished.
     """
     sha256 = hashlib.sha256()
-    name = lambda code: f"{code.__module__}.{code.__qualname__}"  # noqa: E731
 
     def feed(text: str, content: bytes = b"") -> None:
         sha256.update(f"{text}\0".encode() + content)
@@ -62,7 +66,7 @@ def digest(*trees: Any) -> str:
         elif callable(node) and hasattr(node, "__qualname__"):
             feed(name(node))
         else:
-            raise TypeError(f"{name(type(node))} cannot be distinguished from another of its kind")
+            raise TypeError(f"{full_name(type(node))} cannot be distinguished from another of its kind")
 
     walk(trees)
     return sha256.hexdigest()

@@ -23,6 +23,7 @@ from jax.sharding import Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
 
 from .digest import is_key
+from .traced import traced
 
 AXIS = "seq"
 _mesh: contextvars.ContextVar[Mesh | None] = contextvars.ContextVar("nnap_em_mesh", default=None)
@@ -126,7 +127,7 @@ def _program(function: Callable) -> Callable:
         return jax.shard_map(share, mesh=mesh, check_vma=False, **specs)(numbers, batch)
 
     run.__name__ = run.__qualname__ = f"each{function.__name__}"
-    return eqx.filter_jit(run)
+    return traced(run, function)
 
 
 def on_default_device(tree: Any) -> Any:

@@ -1,0 +1,201 @@
+"""Programs that are kept between runs: the same numbers, found again, and never another program's."""
+
+import dataclasses
+import json
+import pickle
+import subprocess
+import sys
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from shell import ENVIRONMENT, ROOT
+
+from nnap_em.model.simulate import examples
+from nnap_em.model.state_space import Inputs, StateSpaceModel
+from nnap_em.numerics import parallel, traced
+from nnap_em.numerics.gaussian import Gaussian
+from nnap_em.smoother.kalman import Affine, Cubature, Tangent
+
+
+@pytest.fixture
+def cache(tmp_path, monkeypatch) -> Path:
+    """A cache in use, in a process that has no program yet."""
+    monkeypatch.setattr(traced._Programs, "folder", tmp_path / "cache")
+    monkeypatch.setattr(traced._Programs, "ready", {})
+    for function in (_linearised, _called_back, _wrong, _named):  # as if it were the package's
+        monkeypatch.setattr(function, "__module__", "nnap_em.somewhere")
+    return tmp_path / "cache"
+
+
+def _kept(cache: Path) -> set[str]:
+    return {path.name for path in cache.glob("*")}
+
+
+def _linearised(common, one):
+    """One step of a slide about each state: a small program, whose outcome is a tuple with names."""
+    model, rule = common
+    x, u = one
+    return jax.vmap(lambda x, u: rule(model, Gaussian(x, jnp.eye(2)), Inputs.held(u)))(x, u)
+
+
+class _Work(NamedTuple):
+    model: StateSpaceModel
+    rule: Tangent | Cubature
+    x: jax.Array
+    u: jax.Array
+
+
+@pytest.fixture(scope="module")
+def work() -> _Work:
+    rng = np.random.default_rng(0)
+    x, u = (jnp.asarray(rng.normal(size=(3, 5, n))) for n in (2, 1))
+    return _Work(examples["slide"]().model, Tangent(), x, u)
+
+
+def _done(work: _Work, monkeypatch) -> Affine:
+    """The outcome of `_linearised` with no program left in memory, as in the next process."""
+    monkeypatch.setattr(traced._Programs, "ready", {})
+    parallel._program.cache_clear()
+    return parallel.each(_linearised, work[:2], work[2:])
+
+
+def _same(a, b) -> None:
+    for one, other in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+class _Opened:
+    """Writes a file where it is unpickled."""
+
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return open, (str(self.path), "w")
+
+
+def test_a_program_found_again_gives_the_same_to_the_last_bit_and_traces_nothing(cache, work, monkeypatch, tmp_path):
+    """An entry is data that runs nothing, neither a pickle nor a function in it; a damaged one is made anew."""
+    calls, transition = [], type(work.model).transition
+    with monkeypatch.context() as patch:
+        patch.setattr(traced._Programs, "folder", None)
+        plain = _done(work, monkeypatch)
+    first = _done(work, monkeypatch)
+    (path,) = cache.glob("*")
+    with monkeypatch.context() as patch:
+        patch.setattr(type(work.model), "transition", lambda *args: calls.append(1) or transition(*args))
+        again = _done(work, monkeypatch)
+        other = _done(work._replace(x=work.x + 1.0), monkeypatch)  # other numbers are no other program
+    assert not calls and len(_kept(cache)) == 1
+    _same(plain, first)
+    _same(first, again)
+    assert type(again) is type(plain)
+    assert np.abs(np.asarray(first.offset - other.offset)).max() > 0
+
+    whole, mark = path.read_bytes(), tmp_path / "mark"
+    form, _, program = whole.partition(b"\n")
+    assert json.loads(form)[0] == "nnap_em.smoother.kalman:Affine"
+    foreign = json.dumps(["os:mkdir", str(mark)]).encode() + b"\n" + program
+    for content in (pickle.dumps(_Opened(mark)), pickle.dumps((program, _Opened(mark))), foreign):
+        path.write_bytes(content)
+        assert traced._read(path) is None
+        assert not mark.exists()
+    path.write_bytes(whole[: len(whole) // 2])
+    _same(first, _done(work, monkeypatch))
+    assert len(path.read_bytes()) == len(whole)
+
+
+OTHERS = {
+    "rule": lambda work: work._replace(rule=Cubature()),
+    "constant": lambda work: work._replace(model=dataclasses.replace(work.model, substeps=3)),
+    "shape": lambda work: jax.tree.map(lambda a: a[:, :4] if a.ndim == 3 else a, work),
+    "type": lambda work: work._replace(u=work.u.astype(jnp.float32)),
+    "text of the package": lambda work: work,
+}
+
+
+@pytest.mark.parametrize("other", OTHERS)
+def test_what_decides_a_program_makes_another(cache, work, monkeypatch, other):
+    _done(work, monkeypatch)
+    if other == "text of the package":
+        monkeypatch.setattr(traced, "surroundings", lambda: "after an edit")
+    with jax.numpy_dtype_promotion("standard"):
+        changed = _done(OTHERS[other](work), monkeypatch)
+        assert len(_kept(cache)) == 2
+        monkeypatch.setattr(traced._Programs, "folder", None)
+        _same(changed, _done(OTHERS[other](work), monkeypatch))
+
+
+def _own(common, one):
+    return common * one
+
+
+def _called_back(common, one):
+    return jax.pure_callback(lambda x: 2 * x, jax.ShapeDtypeStruct((), one.dtype), one, vmap_method="sequential")
+
+
+def _wrong(common, one):
+    raise ZeroDivisionError("told by the function")
+
+
+def _named(common, one):
+    return {"doubled": common * one}
+
+
+def test_what_a_key_cannot_tell_or_a_file_cannot_hold_runs_all_the_same(cache, work, monkeypatch):
+    """A function of another package may say something else tomorrow; so may a closure."""
+    numbers = jnp.arange(3.0)
+    for factor in (2.0, 3.0):
+        np.testing.assert_array_equal(parallel.each(_own, jnp.asarray(factor), numbers), factor * np.arange(3.0))
+    np.testing.assert_array_equal(parallel.each(_called_back, None, numbers), [0.0, 2.0, 4.0])
+    np.testing.assert_array_equal(parallel.each(_named, jnp.asarray(2.0), numbers)["doubled"], [0.0, 2.0, 4.0])
+    with pytest.raises(ZeroDivisionError, match="told by the function"):
+        parallel.each(_wrong, None, numbers)
+    slope = 2.0
+    closure = lambda v: slope * v  # noqa: E731
+    closure.__module__ = "nnap_em.somewhere"
+    with pytest.raises(TypeError, match="somewhere"):
+        traced._key(len, [], closure)
+    assert not _kept(cache)
+    cache.write_text("no folder")
+    assert np.isfinite(np.asarray(_done(work, monkeypatch).matrix)).all()
+
+
+TWO = """
+import json, sys
+import jax, numpy as np
+jax.config.update("jax_enable_x64", True)
+from nnap_em.em.loop import e_step
+from nnap_em.model.simulate import examples, sweep_experiment
+from nnap_em.numerics import parallel, traced
+from nnap_em.smoother.gaussian import CubatureSmoother
+from nnap_em.smoother.start import StartBank
+from pathlib import Path
+traced.use_cache(Path(sys.argv[1]))
+parallel.use_every_device()
+model, sweep = examples["slide"]()
+data, calls = sweep_experiment(model, sweep, 3, 40, key=jax.random.key(0)).data, []
+kind, transition = type(model), type(model).transition
+kind.transition = lambda *args: calls.append(1) or transition(*args)
+found = e_step(model, data, CubatureSmoother(StartBank((1, 3))), key=jax.random.key(0))
+print(json.dumps([jax.device_count(), len(calls), float(np.sum(np.asarray(found.state.mean) ** 2))]))
+"""
+
+
+@pytest.mark.slow  # fast: test_a_program_found_again_gives_the_same_to_the_last_bit_and_traces_nothing
+def test_over_two_devices_another_process_finds_it(tmp_path):
+    """A real one: keys do not hang on what differs among processes, addresses of functions say."""
+
+    def run():
+        command, two = [sys.executable, "-c", TWO, str(tmp_path)], {"JAX_NUM_CPU_DEVICES": "2"}
+        done = subprocess.run(command, cwd=ROOT, env=ENVIRONMENT | two, capture_output=True, text=True, check=True)
+        return json.loads(done.stdout)
+
+    first, again = run(), run()
+    assert len(list(tmp_path.glob("*"))) == 1
+    assert first[0] == again[0] == 2 and first[2] == again[2]
+    assert first[1] > 0 == again[1]

@@ -174,7 +174,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         from . import common
 
         with warnings.catch_warnings(), _stoppable(silent if getattr(args, "quiet", False) else _log) as log:
-            warnings.showwarning = _warn
+            warnings.showwarning = _warn  # pyrefly: ignore[bad-assignment]  (called by place)
             for kind in common.WARNINGS:
                 warnings.simplefilter("always", kind)
             common.set_up()

@@ -33,7 +33,7 @@ def run(args: argparse.Namespace, log: Log) -> int:
     search_share = 0.8
     seconds = search_share * 60.0 * args.minutes if args.minutes else math.inf
     bench, start = prepared(args, AFTER_FILE, log)
-    own = start and own_logs(args, start, log)
+    own = own_logs(args, start, log) if start else None
     with resumable(args, bench, log) as journal:
 
         def report(text: str) -> None:
@@ -42,7 +42,7 @@ def run(args: argparse.Namespace, log: Log) -> int:
 
         diagnosis = diagnose(
             bench.rig, bench.train.data, key=jax.random.key(args.seed), log=report,
-            seconds=seconds - (time.perf_counter() - began), start=start and start.fitted, own=own,
+            seconds=seconds - (time.perf_counter() - began), start=start.fitted if start else None, own=own,
         )  # fmt: skip
         journal.open = not diagnosis.complete and not diagnosis.failure  # the same steps would fail again
         fits, settings = {"before.npz": diagnosis.before, AFTER_FILE: diagnosis.after}, {"seed": args.seed}

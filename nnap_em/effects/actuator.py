@@ -14,7 +14,7 @@ from .base import JointEffect, Scalar, Stream, input_of, one
 class DriveEffect(JointEffect):
     """A law of the input that drives its joint, or of equations of that which its channel names."""
 
-    joint: int | None = eqx.field(static=True, default=None, kw_only=True)  # pyright: ignore[reportIncompatibleVariableOverride]
+    joint: int | None = eqx.field(static=True, default=None, kw_only=True)
 
     def units_on(self, system):
         return {

@@ -310,7 +310,7 @@ class AbstractEffect(eqx.Module):
 class JointEffect(AbstractEffect):
     """A law that acts on one joint."""
 
-    joint: int = eqx.field(static=True, kw_only=True)  # pyright: ignore[reportIncompatibleVariableOverride]  (frozen)
+    joint: int = eqx.field(static=True, kw_only=True)
     """Counted from 1."""
     arguments: ClassVar[tuple[str, ...]] = ()
     """Signals of its force: "position" and "rate" are those of its joint."""
@@ -331,7 +331,7 @@ class JointEffect(AbstractEffect):
 class SensorEffect(AbstractEffect):
     """A law of one reading."""
 
-    channel: str = eqx.field(static=True, kw_only=True)  # pyright: ignore[reportIncompatibleVariableOverride]  (frozen)
+    channel: str = eqx.field(static=True, kw_only=True)
     """The reading; "all": every one."""
 
 

@@ -197,4 +197,4 @@ def _grown(old: LoadFriction, start: LoadFriction, size: float = 1.0) -> Candida
     wide = {name: a(0.5 * (size if name.startswith("square") else 1.0)) for name in numbers}
     if start.log_velocity is not None:
         wide["log_velocity"] = a(0.7)
-    return Candidate(start, probes, replace(start, **wide))
+    return Candidate(start, probes, replace(start, **wide))  # pyrefly: ignore[bad-argument-type]  (numbers)

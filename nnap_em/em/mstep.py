@@ -283,7 +283,7 @@ class ScoringMStep(AbstractMStep):
         pad = multiple * max(1, -(-self.prior.size // multiple)) - self.prior.size
         prior, w, (of_state, of_reading), first = _widened(self.prior, core.w, linear, posterior.state, pad)
         rule = eqx.tree_at(lambda r: (r.prior, r.least), self, (prior, bounds(self.least, prior.size)))
-        linear = linear._replace(by_parameter=of_state, reading_by_parameter=of_reading)
+        linear = linear._replace(by_parameter=of_state, reading_by_parameter=of_reading)  # pyrefly: ignore[bad-argument-type]
         common = (core.log_q, core.log_r, core.start, rule.weights(core).nodes)
         terms = each(_quadratic, common, (linear, posterior, read))
         every = _lengthened((terms, first, posterior.loglik, used))

@@ -199,8 +199,8 @@ def _wide(model: StateSpaceModel, prior: ParameterPrior, path: Gaussian, data: D
     wide = Gaussian(path.mean, jax.device_put(np.broadcast_to(np.diag(spread**2), path.cov.shape)))
     linear = locals_along(model, prior, wide, data, CUBATURE)
     offset = np.asarray(linear.ahead) - np.einsum("stij,stj->sti", linear.affine.matrix, mean)
-    affine = linear.affine._replace(offset=offset, noise=np.zeros(linear.affine.noise.shape, mean.dtype))
-    return linear._replace(affine=affine)
+    none = np.zeros(linear.affine.noise.shape, mean.dtype)
+    return linear._replace(affine=linear.affine._replace(offset=offset, noise=none))  # pyrefly: ignore[bad-argument-type]
 
 
 def _filtered(common, one):

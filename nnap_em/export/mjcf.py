@@ -184,8 +184,8 @@ def _constant(file: OpenFile, joint: str, torque: float) -> None:
 def _rest(a: float, b: float, c: float, d: float) -> float:
     """A coordinate at which the springs pull to neither side, the steepest that pulls back; 0 where there is none."""
     roots = np.roots([d, c, b, a]) if d or c else np.array([-a / b] if b else [])
-    real = np.real(roots[np.abs(np.imag(roots)) < 1e-9 * (1 + np.abs(roots))])
-    return float(min(real, key=lambda q: b + q * (2 * c + 3 * d * q), default=0.0))
+    real = [float(q.real) for q in roots if abs(q.imag) < 1e-9 * (1 + abs(q))]
+    return min(real, key=lambda q: b + q * (2 * c + 3 * d * q), default=0.0)
 
 
 def _noise(file: OpenFile, noise: Float[np.ndarray, " obs"]) -> None:

@@ -167,7 +167,7 @@ class Regression(NamedTuple):
 
         moved = np.zeros_like(self.std)
         if len(moved):
-            moved = least_squares(error, moved, slopes, (self.least, WITHIN), max_nfev=PASSES).x  # pyright: ignore[reportArgumentType]
+            moved = least_squares(error, moved, slopes, (self.least, WITHIN), max_nfev=PASSES).x
         return np.mean(error(moved).reshape(-1, len(self.size)) ** 2, axis=0)
 
     def applied(self, inputs: Float[np.ndarray, "row input"]) -> Float[np.ndarray, "row dof"]:

@@ -131,7 +131,7 @@ def _couplings(model: Any) -> dict[str, tuple[str, Callable[[float], float]]]:
             terms = np.polynomial.Polynomial(np.array(model.eq_data[i][:5], float))
             law = lambda leader, zero=zero, of=of, terms=terms: float(zero + terms(leader - of))  # noqa: E731
             out[model.joint(pair[0]).name] = model.joint(pair[1]).name, law
-    return out
+    return out  # pyrefly: ignore[bad-return]  (defaults of a lambda)
 
 
 # --- what has no place here

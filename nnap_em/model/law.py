@@ -207,7 +207,7 @@ def _fit_joint(
 ) -> LawFit:
     least = (0.005 * max(float(np.max(np.abs(torque))), 1e-9)) ** 2
     cov = cov + np.diag(0.01 * np.diag(cov) + least)
-    whitener = solve_triangular(np.linalg.cholesky(cov), np.eye(len(v)), lower=True)
+    whitener = np.asarray(solve_triangular(np.linalg.cholesky(cov), np.eye(len(v)), lower=True))
     posterior = _Posterior(v, torque, whitener, _sizes(v, torque))
     costs, places = map(np.asarray, zip(*posterior.modes(), strict=True))
     likely, random = np.exp(costs[0] - costs), np.random.default_rng(0)

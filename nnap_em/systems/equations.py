@@ -53,7 +53,7 @@ def unpacked(text: str) -> Text:
     entries = json.loads(text)
     terms = {name: tuple(signals) for name, signals in entries["terms"].items()}
     enters = {name: (state, tuple(signals)) for name, (state, signals) in entries["enters"].items()}
-    return Text(**{**entries, "parameters": tuple(entries["parameters"]), "terms": terms, "enters": enters})
+    return Text(**(entries | {"parameters": tuple(entries["parameters"]), "terms": terms, "enters": enters}))
 
 
 @functools.cache
@@ -76,7 +76,7 @@ class Equations(AbstractPlant):
     simulated: ClassVar[bool] = True
     given: ClassVar[float] = 0.25
     """Two slowest time constants determine a start."""
-    joints: ClassVar[tuple[int, ...]] = ()  # pyright: ignore[reportIncompatibleVariableOverride]
+    joints: ClassVar[tuple[int, ...]] = ()
 
     values: dict[str, Float[Array, ""]]
     """Parameters."""
@@ -114,7 +114,7 @@ class Equations(AbstractPlant):
         return self.ports
 
     @property
-    def sensors(self) -> dict[str, str]:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def sensors(self) -> dict[str, str]:
         """Columns with a formula, and their units."""
         return {name: self.unit(name) for name in self.of.readings}
 

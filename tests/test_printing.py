@@ -5,13 +5,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import nnap_em
 from nnap_em.data.dataset import Dataset
 from nnap_em.data.logs import Logs
 from nnap_em.data.rig import Declared, Rig
 from nnap_em.effects import catalogue
 from nnap_em.fit.identify import begin
-from nnap_em.fit.predict import Prediction
 from nnap_em.model.state_space import with_effects
 
 RIG = Rig(
@@ -24,15 +22,12 @@ Y = np.sin(np.arange(2.0 * ROWS)).reshape(1, ROWS, 2).repeat(3, axis=0)
 Y[0, :15, 0] = np.nan
 DATA = Dataset(np.tile(0.02 * np.arange(ROWS), (3, 1)), np.zeros((3, ROWS, 1)), Y, np.ones((3, ROWS), bool))
 SYSTEM = "Pendulum: m = 0.5 kg, lc = 0.2 m, I = 0.002 kg m^2, g = 9.81 m/s^2; driven joints: 1"
-PREDICTION = Prediction(jnp.zeros((2, 9, 2)), jnp.full((2, 9, 2), 0.5), jnp.arange(18).reshape(2, 9) > 13)
 SAID = {
     "rig": (RIG, "Rig 'bench': pendulum, a row every 0.02 s", "m = 0.5 +- 0.05 kg, lc = 0.2 m", "u on joint 1"),
     "rig noise": (RIG, "theta1 (noise 0.001 rad)", "dtheta1 (noise to be estimated)", "start: theta1 = 0 +- 0.1 rad"),
     "data": (DATA, "Dataset: 3 sequences, 150 rows, the longest 0.98 s; 1 inputs, 2 readings, 5 % missing"),
     "sequence": (Dataset(*(part[1] for part in DATA)), "1 sequence, 50 rows, the longest 0.98 s", "0 % missing"),
     "logs": (Logs(("a.csv", "b.csv", "c.csv"), DATA, ("u", "x")), "Logs a.csv to c.csv: u, x; Dataset: 3 sequences"),
-    "prediction": (PREDICTION, "2 sequences, 4 rows ahead", "[rad and rad/s, or m and m/s]: 0.5, 0.5"),
-    "experiment": (nnap_em.paper.Experiment(DATA, jnp.zeros((3, ROWS, 2))), "all 2 states known; Dataset: 3 sequences"),
 }
 
 
@@ -55,9 +50,6 @@ def test_a_fit_of_a_pendulum_has_torques_and_says_why_it_ended():
     _says(fitted.model.system, SYSTEM)
     _says(fitted.model, SYSTEM, "a row every 0.02 s", "theta1 (noise 0.001 rad)", "torque_offset at joint 1", "N m")
     _says(fitted, "Identified 'bench' after 0 epochs", "estimated: m = 0.5 +- ", " kg", SYSTEM)
-    _says(fitted.model.unknown, "FrictionNetwork of 1 joints, up to ", " rad/s")
-    table = nnap_em.friction_table(fitted, jnp.ones((1, 3)))
-    _says(table, "joint 1: ", " N m over 1 to 1 rad/s, std up to ")
     assert not fitted.converged and "nat" not in str(fitted)
     fitted = fitted._replace(state=fitted.state._replace(stop="at rest", top=np.asarray([10.0, np.nan, 14.0])))
     assert fitted.converged and "(at rest), 12 nat a sequence" in str(fitted)
@@ -67,6 +59,3 @@ def test_a_fit_of_a_slide_has_forces(slide_fit):
     spring = catalogue["torsional_spring"](*map(jnp.asarray, (20.0, 1.0, 0.0, 0.0)), joint=1)
     model = with_effects(slide_fit.model, (spring,))
     _says(model, "x (noise ", " m)", "torsional_spring at joint 1, k = 20 N/m, theta0 = 0.05 m")
-    table = nnap_em.friction_table(slide_fit, jnp.ones((1, 3)))
-    _says(table, "joint 1: ", " N over 1 to 1 m/s, std up to ")
-    assert "N m" not in str(table) and "rad" not in str(table)

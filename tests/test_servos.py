@@ -1,7 +1,6 @@
 """Servos as inputs: their torque is that of MuJoCo's actuators, what is declared comes back, mistakes have a hint."""
 
 import dataclasses
-import re
 from pathlib import Path
 
 import jax
@@ -21,7 +20,6 @@ from nnap_em.effects.actuator import DeadZone, InputDelay, MotorGain, Saturation
 from nnap_em.em.build import build, build_system, measure_scales
 from nnap_em.em.servos import build_servos, steps_of_sample, torque_along
 from nnap_em.export.model import ExportError, write_model
-from nnap_em.fit.check import ERROR, OK, WARNING, drives
 from nnap_em.fit.identifiability import identifiability, sentences
 from nnap_em.fit.identify import begin
 from nnap_em.fit.store import load, save
@@ -313,21 +311,6 @@ def test_what_scales_with_the_gain_and_what_friction_does_is_said(tmp_path):
     assert identifiability(known, build_system(known), build_servos(known)) == ((), (rubbed,))
     bare = dataclasses.replace(known, friction=False)
     assert identifiability(bare, build_system(bare), build_servos(bare)) == ((), ())
-
-
-REMARKS = {  # numbers of a servo whose joint needs 2 N m, 1 of them for its weight, in sequences of 2 s
-    "a limit below the weight": ("limit = 0.4", ERROR, "limited to 0.4 N m.*; the limit is too low; write a"),
-    "a limit above all": ("limit = 30.0", OK, "a position servo, limited to 30 N m"),
-    "a long delay": ("delay = 1.0", WARNING, "a delay of 1 s is much of a sequence of 2 s: write it in seconds"),
-}
-
-
-@pytest.mark.parametrize(("line", "mark", "said"), REMARKS.values(), ids=REMARKS)
-def test_check_says_what_is_doubtful_about_a_servo(tmp_path, line, mark, said):
-    rig = _servo(tmp_path, f"{SERVO}kp = 12.0\n{line}")
-    logs = _logs(np.sin(0.06 * np.arange(200))[None, :, None])
-    (remark,) = drives(rig, build_system(rig), logs, np.full(1, 2.0), np.ones(1))
-    assert remark.mark == mark and re.search(said, remark.text)
 
 
 def test_a_servo_that_no_integration_step_can_follow_is_an_error(tmp_path):

@@ -2,9 +2,6 @@
 
 import dataclasses
 import json
-import pickle
-import subprocess
-import sys
 from pathlib import Path
 from typing import NamedTuple
 
@@ -12,7 +9,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from shell import ENVIRONMENT, ROOT
 
 from nnap_em.model.simulate import examples
 from nnap_em.model.state_space import Inputs, StateSpaceModel
@@ -68,18 +64,8 @@ def _same(a, b) -> None:
         np.testing.assert_array_equal(one, other)
 
 
-class _Opened:
-    """Writes a file where it is unpickled."""
-
-    def __init__(self, path):
-        self.path = path
-
-    def __reduce__(self):
-        return open, (str(self.path), "w")
-
-
 def test_a_program_found_again_gives_the_same_to_the_last_bit_and_traces_nothing(cache, work, monkeypatch, tmp_path):
-    """An entry is data that runs nothing, neither a pickle nor a function in it; a damaged one is made anew."""
+    """An entry is data that runs nothing; a damaged one is made anew."""
     calls, transition = [], type(work.model).transition
     with monkeypatch.context() as patch:
         patch.setattr(traced._Programs, "folder", None)
@@ -99,11 +85,8 @@ def test_a_program_found_again_gives_the_same_to_the_last_bit_and_traces_nothing
     whole, mark = path.read_bytes(), tmp_path / "mark"
     form, _, program = whole.partition(b"\n")
     assert json.loads(form)[0] == "nnap_em.smoother.kalman:Affine"
-    foreign = json.dumps(["os:mkdir", str(mark)]).encode() + b"\n" + program
-    for content in (pickle.dumps(_Opened(mark)), pickle.dumps((program, _Opened(mark))), foreign):
-        path.write_bytes(content)
-        assert traced._read(path) is None
-        assert not mark.exists()
+    path.write_bytes(json.dumps(["os:mkdir", str(mark)]).encode() + b"\n" + program)
+    assert traced._read(path) is None and not mark.exists()
     path.write_bytes(whole[: len(whole) // 2])
     _same(first, _done(work, monkeypatch))
     assert len(path.read_bytes()) == len(whole)
@@ -163,39 +146,3 @@ def test_what_a_key_cannot_tell_or_a_file_cannot_hold_runs_all_the_same(cache, w
     assert not _kept(cache)
     cache.write_text("no folder")
     assert np.isfinite(np.asarray(_done(work, monkeypatch).matrix)).all()
-
-
-TWO = """
-import json, sys
-import jax, numpy as np
-jax.config.update("jax_enable_x64", True)
-from nnap_em.em.loop import e_step
-from nnap_em.model.simulate import examples, sweep_experiment
-from nnap_em.numerics import parallel, traced
-from nnap_em.smoother.gaussian import CubatureSmoother
-from nnap_em.smoother.start import StartBank
-from pathlib import Path
-traced.use_cache(Path(sys.argv[1]))
-parallel.use_every_device()
-model, sweep = examples["slide"]()
-data, calls = sweep_experiment(model, sweep, 3, 40, key=jax.random.key(0)).data, []
-kind, transition = type(model), type(model).transition
-kind.transition = lambda *args: calls.append(1) or transition(*args)
-found = e_step(model, data, CubatureSmoother(StartBank((1, 3))), key=jax.random.key(0))
-print(json.dumps([jax.device_count(), len(calls), float(np.sum(np.asarray(found.state.mean) ** 2))]))
-"""
-
-
-@pytest.mark.slow  # fast: test_a_program_found_again_gives_the_same_to_the_last_bit_and_traces_nothing
-def test_over_two_devices_another_process_finds_it(tmp_path):
-    """A real one: keys do not hang on what differs among processes, addresses of functions say."""
-
-    def run():
-        command, two = [sys.executable, "-c", TWO, str(tmp_path)], {"JAX_NUM_CPU_DEVICES": "2"}
-        done = subprocess.run(command, cwd=ROOT, env=ENVIRONMENT | two, capture_output=True, text=True, check=True)
-        return json.loads(done.stdout)
-
-    first, again = run(), run()
-    assert len(list(tmp_path.glob("*"))) == 1
-    assert first[0] == again[0] == 2 and first[2] == again[2]
-    assert first[1] > 0 == again[1]

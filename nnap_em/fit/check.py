@@ -281,7 +281,6 @@ def torques(rig: Rig, system: AbstractSystem, data: Dataset, scales: Scales) -> 
     """The inputs against gravity and inertia of the declared bodies."""
     mass, gravity = _loads_along(rig, system, data)
     needed = gravity + mass * scales.acceleration
-    yield from drives(rig, system, data, needed, gravity)
     inputs = np.moveaxis(np.asarray(data.u), -1, 0)[: len(rig.input_columns)]
     for name, joint, gear, u in zip(rig.input_columns, rig.input_joints, system.gears, inputs, strict=True):
         if rig.kinds[name] != TORQUE:
@@ -355,32 +354,6 @@ def late(rig: Rig, when: Lag) -> str:
     drive = "a drive or a bus that is late (`diagnose` finds input_delay)"
     cause = drive if when.rows > 0 else "readings that are late"
     return f"{text}: {cause}, or two clocks (`nnap-em import --shift TOPIC=SECONDS`)"
-
-
-def drives(
-    rig: Rig,
-    system: AbstractSystem,
-    data: Dataset,
-    needed: Float[np.ndarray, " dof"],
-    gravity: Float[np.ndarray, " dof"],
-) -> Iterator[CheckResult]:
-    """Limits and delays of the declared servos against the logs."""
-    length = float(data.valid.sum(axis=1).min()) * rig.dt
-    for i, (servo, joint, gear) in enumerate(zip(build_servos(rig), rig.input_joints, system.gears, strict=False)):
-        if not servo.feeds_back:
-            continue
-        name, unit = servo.column, system.force_unit(joint)
-        limit, delay = (float(servo.values.get(key, none)) for key, none in (("limit", np.inf), ("delay", 0.0)))
-        weight, whole = gravity[joint - 1] / abs(gear), needed[joint - 1] / abs(gear)
-        text = f"{name}: a {servo.kind} servo{f', limited to {limit:.3g} {unit}' if np.isfinite(limit) else ''}; "
-        text += f"gravity and inertia of joint {joint} need {whole:.3g}, gravity alone for {weight:.3g} {unit}"
-        low = f"the limit is too low; write a higher one, or look at its unit ({unit}) and at masses (kg)"
-        long = f"a delay of {delay:.3g} s is much of a sequence of {length:.3g} s: write it in seconds"
-        warnings = {low: limit < 0.9 * weight, long: delay > 0.2 * length, "": limit < whole}
-        yield _result("servo", text, {low: limit < 0.5 * weight}, warnings)
-        if not np.ptp(np.asarray(data.u)[..., i][data.valid]):
-            text = f"{name}: its command never changes, so that it shows no gain and no delay"
-            yield CheckResult(WARNING, "servo", text)
 
 
 def _stiff(rig: Rig, system: AbstractSystem, data: Dataset) -> Iterator[CheckResult]:

@@ -111,14 +111,6 @@ class FrictionTable(NamedTuple):
         """Standard deviation of the torque [N m]."""
         return jnp.sqrt(jnp.diagonal(self.cov, axis1=1, axis2=2))
 
-    def __str__(self) -> str:
-        lines = ["FrictionTable"]
-        joints = zip(self.velocity, self.torque, self.std, self.units, strict=True)
-        for j, (v, t, s, (rate, force)) in enumerate(joints, 1):
-            over = f"over {v.min():.3g} to {v.max():.3g} {rate}"
-            lines.append(f"joint {j}: {t.min():.3g} to {t.max():.3g} {force} {over}, std up to {s.max():.2g} {force}")
-        return "\n  ".join(lines)
-
 
 def begin(
     rig: Rig,

@@ -45,17 +45,12 @@ PASSES = 6
 SMALLEST_MISFIT = 5e-5
 """Share of the squared torque that may stay unexplained: 0.7 % of the torque, as a zero off by 0.4 degrees leaves."""
 LARGEST_REMAINDER = 0.25
-"""Largest ratio of the unexplained with a named mistake corrected to that without.
-
-On logs of seven double pendulums and a servo as recorded no correction leaves less than 0.6; where the mistake was made
-on purpose the right one leaves 0.3 at most at its joint, but for zeros off by 2 degrees and some by 10.
-"""
+"""Largest ratio of the unexplained with a named mistake corrected to that without: 0.6 and more on seven double
+pendulums and a servo as recorded; the right correction leaves 0.3 at most at its joint, but for small zeros."""
 UNEXPLAINED = 0.2
 """Largest share of the squared torque that a named mistake leaves unexplained."""
 UNIT_FACTOR = 1.5
 """Factor from which on a torque is in another unit; less may be the gain of a motor, or a mass."""
-
-
 TRIANGLE = {HOLD: (0.5, 0.5, 0.0), SMOOTH: (1 / 12, 5 / 6, 1 / 12)}
 """Weights of the row before, a row and the next in the force in a second difference, a mean over both intervals
 with a triangle as its weight: of inputs that are held, and of smooth ones [Numerov 1924]."""
@@ -109,6 +104,10 @@ class Motion(NamedTuple):
     """Filter of what holds an acceleration."""
     direct: Float[np.ndarray, "dof tap"]
     """Filter of all else, which has the window of the joint's acceleration in it."""
+
+    def filtered_inputs(self, system: AbstractSystem, torque: Float[np.ndarray, "piece time input"]) -> np.ndarray:
+        """`torque` or `coasting` as an acceleration of its joint is filtered."""
+        return _by_joint(torque, self.direct[[joint - 1 for joint in system.joints]])
 
 
 class Regression(NamedTuple):
@@ -255,7 +254,7 @@ def regression(rig: Rig, system: AbstractSystem, data: Dataset) -> Regression | 
     positive = [of.mean > 0 and ("." not in n or n.endswith(("mass", "armature"))) for n, of in uncertain.items()]
     both = zip(uncertain.values(), positive, strict=True)
     least = np.asarray([max(-WITHIN, -of.mean / of.std) if above else -WITHIN for of, above in both])
-    inputs = _by_joint(motion.torque, motion.direct[[joint - 1 for joint in system.joints]])
+    inputs = motion.filtered_inputs(system, motion.torque)
     maps = [filtered(_hats(motion.v[..., j]), taps) for j, taps in enumerate(motion.direct)]
     full = np.ones(inputs.shape[:2], bool)
     problem = Regression(system, motion, mean, np.asarray(std), least, full, inputs, [], inputs)
@@ -347,7 +346,7 @@ def _coasting(rig: Rig, problem: Regression) -> Iterator[Explanation]:
     if names:
         text = f'{" and ".join(names)}: at 0 V the drive does not brake, it coasts, and kind = "voltage" has its '
         text += "back-EMF there, too: set the driver to brake, or leave rows at 0 V out"
-        inputs = _by_joint(motion.coasting, motion.direct[[joint - 1 for joint in problem.system.joints]])[problem.rows]
+        inputs = motion.filtered_inputs(problem.system, motion.coasting)[problem.rows]
         yield Explanation(problem.remains(inputs), text, ruins=False)
 
 

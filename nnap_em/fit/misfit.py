@@ -18,24 +18,20 @@ from ..model.state_space import StateSpaceModel
 from ..numerics.digits import number
 
 PUSHED = 0.85
-"""Random acceleration of a fit as a share of that of the motion, from which on forces without a law move the joint.
-
-With a torque of the wrong sign it is 1.1, with an encoder off by 10 degrees 0.13, on real double pendulums 0.2 to 0.5
-and on a servo whose friction grows with the load 0.66.
-"""
+"""Random acceleration of a fit as a share of that of the motion, from which on forces without a law move the joint: 1.1
+with a torque of the wrong sign, 0.13 with an encoder off by 10 degrees, 0.2 to 0.5 on real double pendulums."""
 UNPREDICTED = 0.25
 """Error over the longest horizon as a share of the motion, below which a fit predicts whatever pushes."""
 UNMOVED = 1.0
 """Error as a share of the motion at every horizon, from which on a prediction that nothing moves is as good."""
 BEYOND_NOISE = 10.0
-"""Error over the shortest horizon, a quarter of a second or of the pace of equations, in standard deviations of the
-noise of a reading, from which on something is missing: 1.8 on simulated slides that lack nothing, 700 and more where a
-force, a rate or a drive was declared wrongly."""
+"""Error over the shortest horizon in standard deviations of the noise, from which on something is missing: 1.8 on
+slides that lack nothing, 700 and more where a force, a rate or a drive was declared wrongly."""
 RUNAWAY = 1e9
 """Error of a prediction that runs away [unit of the reading]."""
 LEFT = 3.0
-"""Distance of a fitted number from its declaration that is reported [standard deviations]: 1 in 370 by chance.
-Three measured rigs with planted effects had 3.4 to 16 without their law, and 0.8 to 2.5 with it."""
+"""Distance of a fitted number from its declaration that is reported [standard deviations]: 3.4 to 16 on three measured
+rigs with planted effects without their law, 0.8 to 2.5 with it."""
 
 
 class Accuracy(NamedTuple):

@@ -13,7 +13,6 @@ from ..em.loop import SMOOTHED, e_step
 from ..em.prior import ParameterPrior
 from ..em.stated import of_states
 from ..model.state_space import Inputs, StateSpaceModel
-from ..numerics.digits import counted
 from ..numerics.gaussian import Gaussian, cholesky, lower
 from ..numerics.parallel import each
 from ..numerics.random import keys_of
@@ -46,12 +45,6 @@ class Prediction(NamedTuple):
     std: Float[Array, "seq time readable"]
     ahead: Bool[Array, "seq time"]
     """Rows later than the given time; the others are smoothed."""
-
-    def __str__(self) -> str:
-        ahead = np.asarray(self.ahead)
-        std = ", ".join(f"{x:.2g}" for x in np.sqrt(np.nanmean(np.asarray(self.std)[ahead] ** 2, axis=0)))
-        amount = f"{counted(len(ahead), 'sequence')}, {counted(ahead.sum(), 'row')} ahead"
-        return f"Prediction: {amount}; std of the states there [rad and rad/s, or m and m/s]: {std}"
 
 
 def given_samples(data: Dataset, given: float) -> Bool[np.ndarray, "seq time"]:

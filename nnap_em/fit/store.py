@@ -154,13 +154,12 @@ def _assemble(path: Path, header: Mapping[str, Any], arrays: Mapping[str, np.nda
         refuse(path, f"{problem}, this is {__version__})", "identify again with this version")
 
     def leaf(place: str, value: Any) -> Any:
-        if place not in leaves:  # a fit may be older than its accuracy
-            return value if place == "/accuracy" else differs(place, "missing in the file")
+        if place not in leaves:
+            differs(place, "missing in the file")
         entry, array = leaves.pop(place), arrays.get(place)
-        if entry["is"] == "code":
-            if name_of(value) != entry["of"]:
-                differs(place, f"{entry['of']!r} in the file")
-        elif entry["is"] != "plain":
+        if entry["is"] == "code" and name_of(value) != entry["of"]:
+            differs(place, f"{entry['of']!r} in the file")
+        if entry["is"] not in ("code", "plain"):
             axes = None if entry["is"] == "key" or value is None else np.ndim(value)
             if array is None or callable(value) or axes not in (None, array.ndim):
                 differs(place, "of another shape" if array is not None else "no array in the file")

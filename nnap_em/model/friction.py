@@ -76,10 +76,6 @@ class FrictionNetwork(AbstractJointMap):
         self.knee = speed / resolution
         self.scale = scale
 
-    def __str__(self) -> str:
-        speeds = ", ".join(f"{float(v):.3g}" for v in self.speed)
-        return f"FrictionNetwork of {len(self.speed)} joints, up to {speeds} rad/s (on a slide: m/s)"
-
     def torque(self, v: Float[Array, " dof"], through: Callable = _together) -> Float[Array, " dof"]:
         """Friction torque at joint velocities [N m], `through` the networks of all joints."""
         top = asinh(self.speed / self.knee)

@@ -89,8 +89,8 @@ def late(
 ) -> Float[Array, "time input"]:
     """Values at the drives of those that commands set, with the effects that take time."""
     columns = []
-    for i, (joint, servo) in enumerate(zip(system.joints, servos, strict=True)):
-        column, before = fed[:, i], servo.before(fed[:, i])
+    for joint, servo, column in zip(system.joints, servos, fed.T, strict=True):
+        before = servo.before(column)
         for effect in effects:
             if effect.joint == joint:
                 column = before + rows.through(effect, column - before)

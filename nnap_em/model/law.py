@@ -48,11 +48,10 @@ LAW_UNITS = {True: ("N m", "N m", "rad/s", "N m s/rad", "rad/s", "N m"), False: 
 
 CROSSED = 2
 """Multiple of the Stribeck velocity, and of that over which the sign changes, from which on a change of velocity in one
-row passes all of its range, from one side of rest to the other: they and the breakaway torque are then not stated.
+row passes all of its range: they and the breakaway torque are then not stated.
 
-Of 46 sets of logs of a slide and a pendulum in code of their own 40 breakaway torques would be stated, 31 of them
-within two standard deviations, the worst 11 away; with this 29 are, 24 within. The other 5 are of one slow slide at
-40 ms: friction is evaluated once in a row of a fit, and their bands are too narrow.
+Of 46 sets of logs of a slide and a pendulum 40 breakaway torques would be stated, 31 of them within two standard
+deviations, the worst 11 away; with this 29 are, 24 within.
 """
 
 
@@ -129,7 +128,7 @@ def nearest(
 
     Without `dip` the breakaway torque is the Coulomb torque, without `constant` the constant torque is 0.
     """
-    posterior = _Posterior(v, torque, whitener, _sizes(v, torque))
+    posterior = _posterior(v, torque, whitener)
     return posterior.natural(posterior.modes(dip, constant, at_start=True)[0][1])
 
 
@@ -179,27 +178,30 @@ class _Posterior(NamedTuple):
     ) -> tuple[float, Float[np.ndarray, " param"]]:
         """Cost and place of the minimum that is reached from a start where some numbers are `free`."""
 
-        def laws(z):
-            out = np.tile(start, (len(z), 1))
-            out[:, free] = z
-            return out
+        def residuals(z):
+            laws = np.tile(start, (len(z), 1))
+            laws[:, free] = z
+            return self.residual(laws)
 
         def slopes(z):
             """Forward differences of all numbers in one call, over the root of the precision as SciPy takes them."""
             step = np.sqrt(np.finfo(float).eps) * np.maximum(np.abs(z), 1.0)
-            off = self.residual(laws(np.vstack([z, z + np.diag(step)])))
+            off = residuals(np.vstack([z, z + np.diag(step)]))
             return ((off[1:] - off[0]) / step[:, None]).T
 
         with np.errstate(over="ignore"):  # a step too far: the next one is shorter
-            residual = lambda z: self.residual(laws(z[None]))[0]  # noqa: E731
-            fit = least_squares(residual, start[free], slopes, method="lm", xtol=1e-8)  # type: ignore[arg-type]
-        return float(fit.cost), laws(fit.x[None])[0]
+            fit = least_squares(lambda z: residuals(z[None])[0], start[free], slopes, method="lm", xtol=1e-8)  # type: ignore[arg-type]
+        place = start.copy()
+        place[free] = fit.x
+        return float(fit.cost), place
 
 
-def _sizes(v: Float[np.ndarray, " node"], torque: Float[np.ndarray, " node"]) -> Float[np.ndarray, " param"]:
-    """Sizes of the numbers of a law by the range of its curve."""
+def _posterior(
+    v: Float[np.ndarray, " node"], torque: Float[np.ndarray, " node"], whitener: Float[np.ndarray, "node node"]
+) -> _Posterior:
+    """With the sizes of its numbers by the range of the curve."""
     top, scale = np.max(np.abs(v)), max(float(np.max(np.abs(torque))), 1e-9)
-    return np.array([scale, scale, top, scale / top, top, scale])
+    return _Posterior(v, torque, whitener, np.array([scale, scale, top, scale / top, top, scale]))
 
 
 def _fit_joint(
@@ -208,7 +210,7 @@ def _fit_joint(
     least = (0.005 * max(float(np.max(np.abs(torque))), 1e-9)) ** 2
     cov = cov + np.diag(0.01 * np.diag(cov) + least)
     whitener = np.asarray(solve_triangular(np.linalg.cholesky(cov), np.eye(len(v)), lower=True))
-    posterior = _Posterior(v, torque, whitener, _sizes(v, torque))
+    posterior = _posterior(v, torque, whitener)
     costs, places = map(np.asarray, zip(*posterior.modes(), strict=True))
     likely, random = np.exp(costs[0] - costs), np.random.default_rng(0)
     begin = places[random.choice(len(places), 48, p=likely / likely.sum())]
@@ -249,29 +251,24 @@ def _draws(
 
 def describe(fit: LawFit, names: tuple[str, ...], angles: tuple[bool, ...]) -> list[str]:
     """One sentence per joint: the numbers of the law, what the curve leaves open, and where it is another curve."""
-    numbers = zip(names, angles, map(np.asarray, fit.value), map(np.asarray, fit.std), strict=True)
-    return [
-        f"{name}: {', '.join(_terms(value, std, LAW_UNITS[angle]))}; {_where(fit, j, LAW_UNITS[angle][2])}"
-        for j, (name, angle, value, std) in enumerate(numbers)
-    ]
-
-
-def _terms(value: Float[np.ndarray, " param"], std: Float[np.ndarray, " param"], units: tuple[str, ...]) -> list[str]:
-    open_ = ~(std <= value) & (np.asarray(PARAMETERS) != "offset")  # NaN is open
-    return [
-        f"{word} not determined" if o else f"{word} {v:.3g} ± {s:.1g} {unit}"
-        for word, v, s, unit, o in zip(CALLED, value, std, units, open_, strict=True)
-    ]
+    out = []
+    for j, (name, angle) in enumerate(zip(names, angles, strict=True)):
+        numbers = zip(CALLED, fit.value[j], fit.std[j], LAW_UNITS[angle], strict=True)
+        terms = [
+            f"{word} {v:.3g} ± {s:.1g} {unit}" if s <= v or word == CALLED[-1] else f"{word} not determined"
+            for word, v, s, unit in numbers  # NaN is not determined
+        ]
+        out.append(f"{name}: {', '.join(terms)}; {_where(fit, j, LAW_UNITS[angle][2])}")
+    return out
 
 
 def _where(fit: LawFit, joint: int, unit: str) -> str:
     """Reason of numbers that are NaN, and the runs of velocities at which the curve departs from the law, in words."""
     fast = f"{fit.passed[joint]:.2g} {unit} is less than a row from rest, so that its shape there is not seen; "
     fast = fast if np.isnan(fit.value[joint]).any() else ""
-    velocity, departs = np.asarray(fit.velocity[joint]), np.asarray(fit.departs[joint])
-    if not departs.any():
+    if not fit.departs[joint].any():
         return f"{fast}the curve agrees with this law within 2 standard deviations."
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], departs, [False]]).astype(int)))
-    ends = [(f"{velocity[a]:.2g}", f"{velocity[b - 1]:.2g}") for a, b in zip(edges[::2], edges[1::2], strict=True)]
+    edges = np.flatnonzero(np.diff(fit.departs[joint].astype(int), prepend=0, append=0))
+    ends = [[f"{fit.velocity[joint][i]:.2g}" for i in (a, b - 1)] for a, b in edges.reshape(-1, 2)]
     runs = [" to ".join(dict.fromkeys(pair)) for pair in ends]
     return f"{fast}the curve departs from this law at {', '.join(runs)} {unit}."

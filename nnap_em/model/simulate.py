@@ -28,9 +28,6 @@ class Experiment(NamedTuple):
     data: Dataset
     x: Float[Array, "seq time state"]
 
-    def __str__(self) -> str:
-        return f"Experiment with all {self.x.shape[-1]} states known; {self.data}"
-
 
 def simulate(
     model: StateSpaceModel,
@@ -58,12 +55,9 @@ def simulate(
     """
     truth = dataclasses.replace(model, substeps=substeps)
     key_process, key_reading = jax.random.split(key)
-    w = jax.random.normal(key_process, (*u.shape[:2], x0.shape[1]), x0.dtype) * jnp.exp(0.5 * model.log_q)[None, None]
-    v = (
-        jax.random.normal(key_reading, (*u.shape[:2], len(model.measured)), x0.dtype)
-        * jnp.exp(0.5 * model.log_r)[None, None]
-    )
-
+    normal = lambda key, count: jax.random.normal(key, (*u.shape[:2], count), x0.dtype)  # noqa: E731
+    w = normal(key_process, x0.shape[1]) * jnp.exp(0.5 * model.log_q)[None, None]
+    v = normal(key_reading, len(model.measured)) * jnp.exp(0.5 * model.log_r)[None, None]
     t = jnp.broadcast_to(model.dt * jnp.arange(u.shape[1], dtype=u.dtype), u.shape[:2])
     blank = Dataset(t, u, v, jnp.ones(u.shape[:2], bool))
 
@@ -223,10 +217,6 @@ class Example(NamedTuple):
     sweep: Sweep
 
 
-def _acrobot() -> Example:
-    return Example(paper_model(), paper_sweep)
-
-
 def _pendubot() -> Example:
     model = paper_model()
     system = dataclasses.replace(model.system, joints=pendubot.drives)
@@ -234,37 +224,29 @@ def _pendubot() -> Example:
 
 
 def _one_joint(
-    system: AbstractSystem, friction: StribeckLaw, spread: Sequence[float], q_std: Sequence[float], r_std: float
+    system: AbstractSystem, friction: Sequence[float], spread: Sequence[float], q_std: Sequence[float], r_std: float
 ) -> StateSpaceModel:
     """A machine with one joint, at rest on average, whose position is read."""
-    return StateSpaceModel(
-        system=system,
-        unknown=friction,
-        start=Gaussian(jnp.zeros(2), jnp.diag(jnp.asarray(spread) ** 2)),
-        log_q=2 * jnp.log(jnp.asarray(q_std)),
-        log_r=2 * jnp.log(jnp.asarray([r_std])),
-        measured=(0,),
-        dt=0.01,
-    )
+    start = Gaussian(jnp.zeros(2), jnp.diag(jnp.asarray(spread) ** 2))
+    law, log_q = StribeckLaw(*(jnp.asarray([value]) for value in friction)), 2 * jnp.log(jnp.asarray(q_std))
+    return StateSpaceModel(system, law, start, log_q, 2 * jnp.log(jnp.asarray([r_std])), (0,), 0.01)
 
 
 def _pendulum() -> Example:
     parameters = {"m": 0.5, "lc": 0.2, "I": 0.002, "g": 9.81}
     system = Pendulum(**{name: jnp.asarray(value) for name, value in parameters.items()}, joints=(1,))
-    friction = StribeckLaw(*(jnp.asarray([value]) for value in (0.03, 0.05, 0.4, 0.01, 0.1)))
-    model = _one_joint(system, friction, (1.0, 1.0), (1e-4, 1e-2), 0.01)
+    model = _one_joint(system, (0.03, 0.05, 0.4, 0.01, 0.1), (1.0, 1.0), (1e-4, 1e-2), 0.01)
     return Example(model, Sweep((0.1, 0.8), (0.5, 3.0), (-math.pi / 2, math.pi / 2)))
 
 
 def _slide() -> Example:
     system = Slide(m=jnp.asarray(1.0), joints=(1,))
-    friction = StribeckLaw(*(jnp.asarray([value]) for value in (1.0, 1.5, 0.05, 2.0, 0.02)))
-    model = _one_joint(system, friction, (0.1, 0.1), (1e-5, 2e-3), 1e-3)
+    model = _one_joint(system, (1.0, 1.5, 0.05, 2.0, 0.02), (0.1, 0.1), (1e-5, 2e-3), 1e-3)
     return Example(model, Sweep((2.0, 8.0), (0.5, 2.0), (-0.1, 0.1)))
 
 
 examples: dict[str, Callable[[], Example]] = {
-    "acrobot": _acrobot,
+    "acrobot": lambda: Example(paper_model(), paper_sweep),
     "pendubot": _pendubot,
     "pendulum": _pendulum,
     "slide": _slide,

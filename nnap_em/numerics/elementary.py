@@ -1,6 +1,6 @@
 """Elementary functions of the hot path, a few products each, that vectorise on a CPU.
 
-`jax.numpy`'s own sine and cosine take more than half of a transition of the acrobot (docs/results/throughput.md).
+`jax.numpy`'s own sine and cosine take more than half of a transition of the acrobot.
 """
 
 import math

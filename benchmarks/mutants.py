@@ -150,7 +150,7 @@ gear left out
 sign of the Stribeck law
 - return -(level * jnp.tanh(v / self.smooth) + self.viscous * v)
 + return level * jnp.tanh(v / self.smooth) + self.viscous * v
-# effects/rate.py
+# effects/friction.py
 ## test_effects.py::test_accelerates_as_the_independent_simulator_says[motor_back_emf]
 a brake that pushes
 - -self.b * self.own(scene.v)
@@ -898,8 +898,8 @@ numbers that were held are held more at the end
 + rule.prior.std * HELD, rule.prior.std
 ## test_search.py::test_states_are_smoothed_and_predicted_by_the_branches_that_a_search_leaves_out
 branches of a hidden angle lost by a search
-- return fit._replace(smoother=CubatureSmoother(fit.bank))
-+ return fit
+- (fit._replace(smoother=CubatureSmoother(fit.bank)) for
++ (fit for
 # diagnosis/backward.py
 ## test_search.py::test_rivals_of_a_law_are_its_equivalents_that_the_motion_shows_and_the_law_elsewhere
 a law gives way to one that the motion does not show

@@ -13,7 +13,6 @@ from helpers import around, declared_model, rate
 
 from nnap_em.data.dataset import Dataset
 from nnap_em.effects import catalogue, fields
-from nnap_em.effects.function import Axis, UnknownFunction
 from nnap_em.model.state_space import with_effects
 
 STEPS, MOTOR = 60, plant.MOTOR_INERTIA
@@ -223,14 +222,6 @@ def test_units_are_those_of_the_machine_and_the_channel():
     for system, name, count, where, units in UNITS:
         effect = catalogue[name](*count * [_a(0.1)], **where)
         assert effect.units_on(declared_model(plant.Case(system=system)).system) == units
-
-
-def test_basis_functions_of_an_angle_go_round():
-    axis = Axis(("theta2",), -np.pi, np.pi, True, 14)
-    np.testing.assert_allclose(axis.basis(_a(0.3)), axis.basis(_a(0.3 + 2 * np.pi)), atol=1e-12)
-    ones = UnknownFunction(jnp.ones(14), (axis,), joint=2)
-    values = [float(ones.torque([_a(v)])) for v in np.linspace(-3, 3, 41)]
-    assert np.ptp(values) < 1e-3 * np.mean(values)  # enough overlap for a constant
 
 
 def test_a_linear_law_is_tried_from_no_strength():

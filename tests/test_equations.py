@@ -10,7 +10,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import scipy.integrate
 import scipy.linalg
 from helpers import written_again
 
@@ -81,12 +80,10 @@ def fit(chain):
 FORMULAS = {  # at a = 2, b = 3
     "a + b*2^2 - -b": 2 + 3 * 4 + 3,
     "2^a^2/8": 2**4 / 8,
-    "-a^2": -4.0,
-    "sqrt(b)*exp(-a) + log(b) + abs(-a)": math.sqrt(3) * math.exp(-2) + math.log(3) + 2,
+    "sqrt(b)*exp(-a) + log(b) + abs(-a^2)": math.sqrt(3) * math.exp(-2) + math.log(3) + 4,
     "min(a, b) + max(a, b)*tanh(a)": 2 + 3 * math.tanh(2),
     "sin(a)*cos(b) + sign(a - b)": math.sin(2) * math.cos(3) - 1,
-    "where(a > b, 1, 10) + where(a <= 2, 5, 7)": 15.0,
-    "1e-3*a": 2e-3,
+    "where(a > b, 1, 10) + where(a <= 2, 5, 7) + 1e-3*a": 15.002,
 }
 MISTAKES = {  # in a formula of h1 and k1: what is said of the place, and the hint
     "k1*sqrt(h3)": ("at character 9", "did you mean 'h1'"),
@@ -95,8 +92,6 @@ MISTAKES = {  # in a formula of h1 and k1: what is said of the place, and the hi
     "k1 +* h1": ("at character 5", "not a formula"),
     "__import__('os')": ("at character 1", "unknown function"),
     "h1.real": ("at character 1", "Attribute is not part of formulas"),
-    "h1 if k1 else 2": ("at character 1", "IfExp is not part"),
-    "'a'": ("at character 1", "is no number"),
 }
 
 
@@ -122,14 +117,11 @@ def test_a_root_has_no_slope_without_end_and_no_value_below_zero():
 
 DECLARED = [  # a text of the declaration, what stands in its place, and what is said of it
     ('b = "(a - b)/tb" }', 'b = "(a - b)/tc" }', "[model.rates] b: at character 9"),
-    (', b = "(a - b)/tb" }', " }", "[model.rates] b: a state without rate"),
     ('b = "(a - b)/tb" }', 'b = "(a - b)/2" }', "[model] tb: no equation and no reading uses it"),
     ('{ u = "V" }', '{ u = "" }', "[model.inputs] u: missing unit"),
     ('{ y = "b" }', '{ y = "c" }', "[measurement.columns] y: at character 1"),
     ('{ y = "b" }', '["c"]', "'c' is no state; possible here: a, b"),
-    ('a = "V", b', 'a = "V", sqrt', "cannot be a name"),
     ("[mea", "[model.unknown]\nf = { signals = ['c'], enters = 'a' }\n[mea", "'c' is no state or input"),
-    ("[mea", "[model.unknown]\nf = { signals = ['a'] }\n[mea", "[model.unknown] f: no equation"),
 ]
 
 
@@ -185,33 +177,31 @@ def test_an_unknown_term_is_a_port_where_its_name_stands():
     assert [float(a) for a in plant.sensed(q, none, none, jnp.asarray([0.5, 2.0]))] == [5.0]
 
 
-def test_time_constants_are_those_of_the_eigenvalues(chain):
+def test_time_constants_are_those_of_the_eigenvalues_and_every_row_is_in_one_window(chain):
     seen = motion(chain[0].model, chain[1])
     np.testing.assert_allclose([seen.slowest, seen.fastest], [4.0, 0.5], rtol=1e-9)
+    at = simulated.windows(chain[0].model, chain[1])
+    assert (at.count, at.rows, at.every) == (2, 120, 1)  # 240 rows of 0.5 s, two paces of 32 s a window
+    np.testing.assert_array_equal(at.row.ravel(), np.arange(240))
 
 
-UNSTABLE, DOUBLE = np.array([[0.0, 6.0], [6.0, 0.0]]), np.array([[0.0, 1.0], [0.0, 0.0]])
-
-
-@pytest.mark.parametrize(
-    ("rate", "expected"),
-    [
-        (UNSTABLE, {"growth": 6.0, "unstable": ("a", "b")}),
-        (np.array([[-3.0, 0.0], [1.0, 0.4]]), {"growth": 0.4, "unstable": ("b",)}),
-        (np.array([[-3.0, 0.0], [1.0, 0.1]]), {"kept": ()}),  # grows by e^1 in half of the recording
-        (np.array([[0.0, 1.0], [-9.0, -0.2]]), {"kept": ()}),
-        (np.array([[0.0, 1.0], [-9.0, 0.0]]), {"kept": ()}),
-        (DOUBLE, {"kept": ("a", "b")}),
-        (np.array([[-3.0, 0.0], [1.0, 0.0]]), {"kept": ("b",)}),
-    ],
+MODES = (
+    ([[0.0, 6.0], [6.0, 0.0]], {"growth": 6.0, "unstable": ("a", "b")}),
+    ([[-3.0, 0.0], [1.0, 0.1]], {"kept": ()}),  # grows by e^1 in half of the recording
+    ([[0.0, 1.0], [-9.0, 0.0]], {"kept": ()}),
+    ([[0.0, 1.0], [0.0, 0.0]], {"kept": ("a", "b")}),
+    ([[-3.0, 0.0], [1.0, 0.0]], {"kept": ("b",)}),
 )
-def test_unstable_modes_and_integrators_are_those_of_the_eigenvalues(rate, expected):
+
+
+def test_unstable_modes_and_integrators_are_those_of_the_eigenvalues():
     dt, rows = 0.05, 400
-    step = np.broadcast_to(scipy.linalg.expm(dt * rate), (2, rows, 2, 2))
-    found = _modes(("a", "b"), step, dt)
-    assert set(found) == set(expected)
-    for name, value in expected.items():
-        assert found[name] == (pytest.approx(value, rel=1e-3) if name == "growth" else value)
+    for rate, expected in MODES:
+        step = np.broadcast_to(scipy.linalg.expm(dt * np.array(rate)), (2, rows, 2, 2))
+        found = _modes(("a", "b"), step, dt)
+        assert set(found) == set(expected)
+        for name, value in expected.items():
+            assert found[name] == (pytest.approx(value, rel=1e-3) if name == "growth" else value)
 
 
 def test_predictions_of_an_unstable_plant_end_when_errors_have_grown_e_fold(chain):
@@ -222,40 +212,6 @@ def test_predictions_of_an_unstable_plant_end_when_errors_have_grown_e_fold(chai
     assert pace_of(rig, seen._replace(growth=0.2), 1000) == 5.0
     assert pace_of(rig, seen._replace(growth=2.0), 1000) == 2.0  # four rows
     assert pace_of(dataclasses.replace(rig, horizon=9.0), seen._replace(growth=0.2), 1000) == 9.0
-
-
-BALANCED = """[model]
-type = "equations"
-inputs = { u = "V" }
-states = { x = "m" }
-rates = { x = "a*x + b*u" }
-a = { mean = 1.0, std = 1.0 }
-b = { mean = 1.0, std = 0.5 }
-[measurement]
-columns = ["x"]
-"""
-
-
-@pytest.mark.slow  # fast: test_unstable_modes_and_integrators_are_those_of_the_eigenvalues
-def test_an_unstable_plant_under_feedback_is_identified_and_called_so(tmp_path):
-    """x' = 2 x + 1.5 u, u = -3 y + steps: a free simulation of a recording would grow e^24-fold."""
-    rng, a, b, dt, rows = np.random.default_rng(0), 2.0, 1.5, 0.05, 240
-    grown, x, log = math.exp(a * dt), 0.1, []
-    steps = np.repeat(rng.uniform(-1, 1, rows // 8), 8)
-    for excitation in steps:
-        y = x + 0.003 * rng.standard_normal()
-        u = excitation - 3.0 * y
-        log.append((u, y))
-        x = grown * x + (grown - 1) / a * b * u + 0.003 * rng.standard_normal()
-    u, y = np.array(log).T
-    data = pad([(dt * np.arange(rows), u[:, None], y[:, None])])
-    rig = _rig(tmp_path, BALANCED, TAIL.replace("0.5", "0.05"))
-    text = next(result for result in check(rig, data, None, key=jax.random.key(0)) if result.subject == "sampling").text
-    assert "unstable: deviations of x grow at 1 1/s" in text
-    fitted = identify(rig, data, key=jax.random.key(0))
-    for name, true in (("a", a), ("b", b)):
-        value, std = parameter_table(fitted)[name]
-        assert abs(value - true) < 4 * std and std < 0.1 * true
 
 
 SWING = """[model]
@@ -298,35 +254,18 @@ def test_scales_are_those_of_the_readings_where_the_equations_rest(tmp_path):
 DIVIDED = CHAIN.replace("(a - b)/tb", "(a - b)/u/tb")
 
 
-@pytest.mark.parametrize(
-    ("low", "mend"), [(0.0, "write max(u, 0.1) for u"), (-2.0, "write where(u < 0, min(u, -0.1), max(u, 0.1)) for u")]
-)
-def test_rates_that_are_infinite_are_named_with_file_rows_input_and_mend(tmp_path, low, mend):
+def test_rates_that_are_infinite_are_named_with_file_rows_input_and_mend(tmp_path):
     data = _chain()
     u = np.array(data.u)
-    u[0, :, 0] = np.where(np.arange(240) % 2, 2.0, low or 1.0)
+    u[0, :, 0] = np.where(np.arange(240) % 2, 2.0, 1.0)
     u[0, 5:12] = 0.0
     rig, data = _rig(tmp_path, DIVIDED), data._replace(u=u)
     (found,) = [result for result in check(rig, data, None, key=jax.random.key(0)) if result.subject == "rates"]
     text = "the rates of b are infinite or no number in sequence 0, 7 rows from 6 to 12; u is 0 there: "
     assert found.mark == "error"
-    assert text + mend in found.text
+    assert text + "write max(u, 0.1) for u" in found.text
     with pytest.raises(RigError, match="sequence 0, 7 rows from 6 to 12"):
         identify(rig, data, key=jax.random.key(0))
-    mended = _rig(tmp_path, CHAIN.replace("(a - b)/tb", "(a - b)/max(u, 0.1)/tb"))
-    assert not [result for result in check(mended, data, None, key=jax.random.key(0)) if result.subject == "rates"]
-
-
-def test_a_state_that_is_read_is_determined_where_it_rests_at_first(tmp_path):
-    data = _chain(rows=240)
-    u, y = np.array(data.u), np.array(data.y)
-    u[0], y[0, :, 0] = 0.0, 0.01 * np.random.default_rng(0).standard_normal(240)
-    u[0, 150:] = 1.0
-    y[0, 150:, 0] += 1.3 * 3.0 * (1 - np.exp(-0.5 * np.arange(90) / 4.0))
-    rig = _rig(tmp_path, CHAIN.replace('y = "b"', 'y = "b", z = "a"'))
-    data = data._replace(u=u, y=np.concatenate([y, y], axis=-1))
-    (found,) = [result for result in check(rig, data, None, key=jax.random.key(0)) if result.subject == "states"]
-    assert found.mark == "ok" and "determine 2 of 2" in found.text
 
 
 def test_readings_at_the_ends_of_their_range_are_not_read(tmp_path):
@@ -357,12 +296,6 @@ def test_derivatives_of_open_loop_errors_are_those_of_differences(chain):
         np.testing.assert_allclose(here.columns[..., i], -slope, rtol=1e-5, atol=1e-7)
         slope = (errors(np.zeros(2), still + step).error - errors(np.zeros(2), still - step).error) / 2e-5
         np.testing.assert_allclose(here.by_start[..., i], -slope, rtol=1e-5, atol=1e-7)
-
-
-def test_every_row_is_in_one_window(chain):
-    at = simulated.windows(chain[0].model, chain[1])
-    assert (at.count, at.rows, at.every) == (2, 120, 1)  # 240 rows of 0.5 s, two paces of 32 s a window
-    np.testing.assert_array_equal(at.row.ravel(), np.arange(240))
 
 
 def test_a_fit_to_open_loop_errors_is_where_their_likelihood_and_the_prior_are_highest(chain):
@@ -402,13 +335,6 @@ def test_a_simulation_that_runs_away_makes_no_step_singular():
     np.testing.assert_allclose(ratio, variances[0] / variances[1], rtol=1e-9)
 
 
-def test_a_fit_ends_when_its_time_is_over(chain):
-    fitted, data = chain
-    at = simulated.filtered(fitted.model, data)
-    with pytest.raises(TimeoutError):
-        simulated.fit_all([fitted.model], [fitted.m_step.prior], data, begin=at, scale=np.ones((1, 1, 1, 1)), until=0.0)
-
-
 def test_the_fit_of_the_smaller_errors_is_kept(chain, fit, monkeypatch):
     """A fit to long horizons that is worse by the errors that it is fitted to is not kept."""
 
@@ -422,20 +348,15 @@ def test_the_fit_of_the_smaller_errors_is_kept(chain, fit, monkeypatch):
     assert 0 < table["k"][1] < 0.1
 
 
-def _simulated(error) -> simulated.Simulated:
-    none = np.zeros((*error.shape, 0))
-    return simulated.Simulated(None, None, np.zeros(0), np.zeros((1, error.shape[1], 0)), error, none, none)  # type: ignore[arg-type]
-
-
-@pytest.mark.parametrize("rho", [0.0, 0.8])
-def test_independent_errors_are_those_of_an_autoregression(rho):
+def test_independent_errors_are_those_of_an_autoregression():
     """(1 - rho) / (1 + rho) of all; four standard deviations of twenty other seeds."""
-    rng = np.random.default_rng(0)
+    rng, rho = np.random.default_rng(0), 0.8
     error = rng.standard_normal((1, 50, 400, 1)) * np.sqrt(1 - rho**2)
     for k in range(1, 400):
         error[:, :, k] += rho * error[:, :, k - 1]
-    expected = error.size * (1 - rho) / (1 + rho)
-    np.testing.assert_allclose(simulated.independent(_simulated(error)), expected, rtol=0.2)
+    none = np.zeros((*error.shape, 0))
+    of = simulated.Simulated(None, None, np.zeros(0), np.zeros((1, 50, 0)), error, none, none)  # type: ignore[arg-type]
+    np.testing.assert_allclose(simulated.independent(of), error.size * (1 - rho) / (1 + rho), rtol=0.2)
 
 
 def test_an_input_that_takes_time_begins_as_it_is(chain):

@@ -8,7 +8,7 @@ from helpers import around, slide
 from nnap_em.diagnosis.keys import replaced
 from nnap_em.diagnosis.propose import seeded
 from nnap_em.effects import flat
-from nnap_em.effects.periodic import OVERTONES, PeriodicForce
+from nnap_em.effects.function import OVERTONES, PeriodicForce
 from nnap_em.model.state_space import with_effects
 
 MODEL, _ = slide()

@@ -16,10 +16,9 @@ from nnap_em.data.rig import read_rig
 from nnap_em.effects import AbstractEffect
 from nnap_em.effects.actuator import DeadZone, MotorGain, OneSidedLoss
 from nnap_em.effects.base import a
-from nnap_em.effects.friction import LoadFriction, PositionDependentFriction
+from nnap_em.effects.friction import AirDrag, LoadFriction, PositionDependentFriction
 from nnap_em.effects.mounting import BaseVibration
 from nnap_em.effects.position import Cogging, EddyBrake, TorsionalSpring
-from nnap_em.effects.rate import AirDrag
 from nnap_em.effects.sensor import SensorBias, SensorScale
 from nnap_em.model.state_space import Inputs, StateSpaceModel, with_effects
 from nnap_em.numerics.gaussian import Gaussian

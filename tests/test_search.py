@@ -1,6 +1,7 @@
 """Decisions of the search on numbers: laws that are refitted, enter a model or leave it, and what a failure leaves."""
 
 import dataclasses
+import functools
 import math
 import time
 from unittest import mock
@@ -18,7 +19,7 @@ from nnap_em.data.rig import Declared, Rig
 from nnap_em.diagnosis import backward, rounds, search, verdict
 from nnap_em.diagnosis.context import SearchContext, ahead, chosen
 from nnap_em.diagnosis.hypothesis import Evidence, Hypothesis, covariances
-from nnap_em.diagnosis.keys import completed, contains, elsewhere, key_of, remainder_of, replaced
+from nnap_em.diagnosis.keys import completed, key_of, remainder_of, replaced
 from nnap_em.diagnosis.losses import MultiStep
 from nnap_em.diagnosis.outcome import Diagnosis, Step, Suspect
 from nnap_em.diagnosis.propose import seeded
@@ -37,6 +38,7 @@ from nnap_em.smoother.start import StartBank
 from nnap_em.storage.deadline import TimeUp, until
 from nnap_em.storage.journal import HERE, step
 
+GAIN, ZONE, DRAG, HOOKE, FREE = "motor_gain", "dead_zone", "air_drag", "torsional_spring", "unknown_function"
 MODEL, RULE = slide()
 BARE = Hypothesis(MODEL, RULE)
 DATA = Dataset(np.tile(0.05 * np.arange(9), (6, 1)), *(np.zeros((6, 9, n)) for n in (1, 2)), np.ones((6, 9), bool))
@@ -109,8 +111,7 @@ def test_certainty_is_the_marginal_of_the_posterior():
 
 def test_one_fit_is_ahead_of_another_by_what_it_is_likelier_less_a_sixth_at_either_end():
     assert ahead(np.array([np.nan, 1e9, 1.0, 2.0, 3.0, 4.0]), np.zeros(6)) == pytest.approx(6 * 2.5)
-    assert ahead(np.array([1.0, 2.0]), np.zeros(2)) == pytest.approx(3.0)
-    assert ahead(np.full(6, 5.0), np.full(6, 3.0)) == pytest.approx(12.0)
+    assert ahead(np.array([3.0, 4.0]), np.array([2.0, 2.0])) == pytest.approx(3.0)
 
 
 def test_the_fit_of_the_least_error_is_kept_the_likelier_of_near_ones_and_none_that_predicts_worse():
@@ -119,13 +120,11 @@ def test_the_fit_of_the_least_error_is_kept_the_likelier_of_near_ones_and_none_t
     assert {left: chosen(left, tops) for left in cases} == cases
 
 
-@pytest.mark.parametrize("place", [0, 1, 2])
-def test_one_of_three_effects_goes_with_its_prior_and_its_reason(place):
-    left, names = [i for i in range(3) if i != place], ("motor_gain", "dead_zone", "air_drag")
-    hypothesis = _with(*names).without(place)
-    assert _names(hypothesis.model) == [names[i] for i in left]
-    assert [f.removed for f in hypothesis.evidence if f] == [0.5 + 0.1 * i for i in left]
-    np.testing.assert_allclose(hypothesis.m_step.prior.std, [0.1, *(2.0 + i for i in left)])
+def test_one_of_three_effects_goes_with_its_prior_and_its_reason():
+    hypothesis = _with("motor_gain", "dead_zone", "air_drag").without(1)
+    assert _names(hypothesis.model) == ["motor_gain", "air_drag"]
+    assert [f.removed for f in hypothesis.evidence if f] == [0.5, 0.7]
+    np.testing.assert_allclose(hypothesis.m_step.prior.std, [0.1, 2.0, 4.0])
     assert [name.partition(".")[0] for name in hypothesis.m_step.prior.names] == ["m", "0", "1"]
 
 
@@ -141,20 +140,9 @@ def test_a_rest_belongs_to_the_law_of_the_same_signals_at_its_joint():
     model, rest = with_effects(MODEL, (_law("motor_gain"), SPRING)), _axes("x")
     assert remainder_of(rest, model) == 1
     assert remainder_of(OF_INPUT, model) == 0
-    assert remainder_of(dataclasses.replace(rest, joint=2), model) is None
-    assert remainder_of(SPRING, model) is None
-    assert remainder_of(rest, with_effects(MODEL, (_law("motor_gain"), _law("air_drag")))) is None
+    assert remainder_of(dataclasses.replace(rest, joint=2), model) is remainder_of(SPRING, model) is None
     free = with_effects(MODEL, (rest,))
     assert completed(SPRING, free) and not completed(SPRING, model) and not completed(_law("motor_gain"), free)
-    assert completed(_law("motor_gain"), with_effects(MODEL, (OF_INPUT,)))
-
-
-def test_what_contains_what_and_what_is_elsewhere():
-    one, two, gain = _axes("x"), _axes("x", "dx"), _law("motor_gain")
-    assert contains(two, one, MODEL.system) and not contains(one, two, MODEL.system)
-    assert contains(one, SPRING, MODEL.system) and not contains(one, gain, MODEL.system)
-    assert not contains(two, SPRING, MODEL.system)  # another signal is another cause
-    assert elsewhere(key_of(gain), key_of(_law("motor_gain", joint=2)))
 
 
 def test_a_fit_starts_where_the_screen_puts_a_linear_law_and_at_the_probe_of_another():
@@ -163,32 +151,23 @@ def test_a_fit_starts_where_the_screen_puts_a_linear_law_and_at_the_probe_of_ano
     assert float(jax.tree.leaves(seeded(zone, np.array([-2.0])))[0]) == 0.75
 
 
-def _functions(joint: int, *names: str):
-    """Functions of these signals at a joint: the one that repeats each turn, and the one that does not."""
-    functions = [c.start for c in catalogue["unknown_function"].candidates(AROUND) if c.start.joint == joint]
-    turning, still = (e for e in functions if e.inputs_named() == names and len(e.axes) == 1)
-    return turning, still
-
-
 def test_a_function_of_each_turn_and_one_of_all_turns_are_rivals():
-    turning, still = _functions(2, "theta2")
+    every = [c.start for c in catalogue["unknown_function"].candidates(AROUND) if len(c.start.axes) == 1]
+    turning, still = (e for e in every if e.joint == 2 and e.inputs_named() == ("theta2",))
     assert key_of(turning) == key_of(still)
     spring = catalogue["torsional_spring"].candidates(AROUND)[0].start
     model = with_effects(ACROBOT, (spring, turning))
     assert replaced(still, model) == 1
-    assert replaced(turning, model) is None
-    assert replaced(_functions(1, "theta1")[1], model) is None
-    assert replaced(spring, model) is None
+    assert {replaced(law, model) for law in (turning, spring, *(e for e in every if e.joint == 1))} == {None}
 
 
 def test_a_stop_that_yields_is_none():
     """One that a typical torque pushes in by half a radian, or whose ends nearly meet, is a spring in disguise."""
     stop = next(c for c in catalogue["hard_stop"].candidates(AROUND) if c.start.joint == 2).probes[0]
-    assert stop.is_physical()
     half = np.log(2.0 * AROUND.torque[1])  # N m/rad
-    assert eqx.tree_at(lambda s: s.stiffness, stop, half + 0.01).is_physical()
-    assert not eqx.tree_at(lambda s: s.stiffness, stop, half - 0.01).is_physical()
-    assert not eqx.tree_at(lambda s: s.lower, stop, stop.upper - 0.1).is_physical()
+    assert dataclasses.replace(stop, stiffness=half + 0.01).is_physical()
+    assert not dataclasses.replace(stop, stiffness=half - 0.01).is_physical()
+    assert not dataclasses.replace(stop, lower=stop.upper - 0.1).is_physical()
 
 
 # --- a round
@@ -200,32 +179,22 @@ def _screened(law: AbstractEffect, share: float, chance: float = 0.0, folds=None
     return Screened(_candidate(law), np.ones(1), explained, band, 0.15, chance)
 
 
-def _gain(share, chance=0.0, value=1.0, joint=1, **more):
-    return _screened(_law("motor_gain", value, joint), share, chance, **more)
+def _named(name: str, share: float, value: float = 1.0, joint: int = 1, **more):
+    return _screened(_law(name, value, joint), share, **more)
 
 
-def _zone(share, **more):
-    return _screened(_law("dead_zone"), share, **more)
-
-
-def _drag(share, value=1.0, **more):
-    return _screened(_law("air_drag", value), share, **more)
-
-
-def _spring(share, **more):
-    return _screened(SPRING, share, **more)
-
-
-def _free(share, *names, **more):
+def _free(share: float, *names: str, **more):
     return _screened(_axes(*(names or ("x",))), share, **more)
 
 
-def _run(entries, errors=None, hypothesis=BARE, shortlist=8, steps=None, p=None, unfitted="", late=math.inf):
-    """A round over these candidates, and the names of those that were refitted in turn.
+_gain, _zone, _drag = (functools.partial(_named, name) for name in (GAIN, ZONE, DRAG))
+_spring = functools.partial(_screened, SPRING)
 
-    A refit removes what the screen said, or leaves `errors` by name, or in turn; that of `unfitted` removes nothing
-    along its step.  Of the forms of a law it takes the one whose first number has the largest of `steps`.  The time is
-    up before number `late`; `p` is the chance of errors as large as since the fit.
+
+def _run(entries, errors=None, hypothesis=BARE, shortlist=8, steps=None, p=None, unfitted="", late=math.inf):
+    """A round over these candidates, and the names of those that were refitted in turn: a refit removes what the screen
+    said, or leaves `errors` by name, or in turn; that of `unfitted` removes nothing along its step.  Of the forms of a
+    law it takes the one whose first number has the largest of `steps`.  The time is up before number `late`.
     """
     tried = []
 
@@ -247,62 +216,38 @@ def _run(entries, errors=None, hypothesis=BARE, shortlist=8, steps=None, p=None,
         return decided(entries, refitted, step, hypothesis.model, CONTEXT._replace(risen=risen)), tried
 
 
-GAIN, ZONE, DRAG, HOOKE, FREE = "motor_gain", "dead_zone", "air_drag", "torsional_spring", "unknown_function"
 SPRUNG = {"hypothesis": BARE.plus(SPRING, _candidate(SPRING))}
-OVERSHOT = _gain(0.76, value=2.0, folds=(0.9, 0.9, -0.2))  # a ripple of nine periods, which one part contradicts
-MANY = ("motor_gain", "dead_zone", "air_drag", "viscous_change", "torque_offset", "motor_back_emf")
-MANY = [_law(name) for name in MANY]
+MANY = [_law(name) for name in (GAIN, ZONE, DRAG, "viscous_change", "torque_offset")]
 ROUNDS = {  # what the screen says, options, the laws that are refitted in turn, and the one that is accepted
     "a law over the floor": ([_gain(0.151)], {}, [GAIN], GAIN),
     "a law below the floor": ([_gain(0.149)], {}, [], None),
-    "a law over twice the chance level": ([_gain(0.3, 0.149)], {}, [GAIN], GAIN),
-    "a law within twice the chance level": ([_gain(0.3, 0.151)], {}, [], None),
-    "a law without a name over its higher bar": ([_free(0.251)], {}, [FREE], FREE),
+    "a law within twice the chance level": ([_gain(0.3, chance=0.151)], {}, [], None),
     "a law without a name below its higher bar": ([_free(0.249)], {}, [], None),
-    "the smaller of both shares counts": ([_gain(0.5, left_out=0.1)], {}, [], None),
     "parts that disagree": ([_gain(0.5, folds=(0.9, -0.1, -0.1))], {}, [], None),
     # a named law beside a function: one that does not contain it, where it is even with six tenths
-    "another cause that is even with the function": ([_free(0.55), _drag(0.3)], {}, [FREE, DRAG], DRAG),
     "another cause that is not": ([_free(0.56), _drag(0.3)], {}, [FREE], FREE),
     # one that it contains: the parts left out are the same, so that both differ by what they explain
     "a law that explains what its function does": ([_free(0.5), _spring(0.46)], {}, [HOOKE], HOOKE),
     "a law that explains less than its function": ([_free(0.5), _spring(0.44)], {}, [FREE, HOOKE], FREE),
-    "a law that explains much less": ([_free(0.5), _spring(0.26)], {}, [FREE], FREE),
     "a refit shows that a law is even": ([_free(0.5), _spring(0.4)], {"errors": {HOOKE: 0.54}}, [FREE, HOOKE], HOOKE),
-    "a refit shows that it is not": ([_free(0.5), _spring(0.4)], {"errors": {HOOKE: 0.56}}, [FREE, HOOKE], FREE),
-    "a function that is rejected": ([_free(0.5), _spring(0.2)], {"errors": {FREE: 0.95}}, [FREE, HOOKE], HOOKE),
     "a function of fewer signals": ([_free(0.5, "x", "dx"), _free(0.46)], {}, [FREE], (FREE, 1, None, ("x",))),
-    "one that explains less": ([_free(0.5, "x", "dx"), _free(0.44)], {}, [FREE, FREE], (FREE, 1, None, ("x", "dx"))),
-    "each is even with the next": (
-        [_free(0.42), _free(0.46, "x", "dx"), _spring(0.38)], {}, [HOOKE], HOOKE),
-    "a named law, a function that contains it, and another cause": (
-        [_spring(0.60), _free(0.72), _zone(0.53)], {"errors": {HOOKE: 0.27, FREE: 0.27}}, [FREE, HOOKE], HOOKE),
     # a free function is no change where errors have not risen by two standard deviations since the fit
     "a function where errors have risen": ([_free(0.5), _spring(0.2)], {"p": 0.022}, [FREE], FREE),
     "a function where they have not": ([_free(0.5), _spring(0.2)], {"p": 0.023}, [FREE], None),
     "a named law where they have not": ([_spring(0.2)], {"p": 0.023}, [HOOKE], HOOKE),
     "the remainder of a law before another cause": ([_drag(0.5), _free(0.28)], SPRUNG, [DRAG, FREE], FREE),
-    "a remainder that is too small": ([_drag(0.5), _free(0.26)], SPRUNG, [DRAG], DRAG),
     # an alias of what shows soon does not stand before a law that the longer horizons show
     "a law of the longer horizons": ([_zone(0.4, band=1), _gain(0.2)], {}, [GAIN], GAIN),
-    "a law of the shorter ones alone": ([_zone(0.4, band=1)], {}, [ZONE], ZONE),
-    "a law of the longer ones that is rejected": (
-        [_zone(0.4, band=1), _gain(0.2)], {"errors": {GAIN: 0.95}}, [GAIN, ZONE], ZONE),
-    "the best is rejected": ([_gain(0.5), _zone(0.3)], {"errors": {GAIN: 0.92}}, [GAIN, ZONE], ZONE),
     "two are rejected": ([_gain(0.5), _zone(0.3)], {"errors": {GAIN: 0.92, ZONE: 1.2}}, [GAIN, ZONE], None),
     # what the screen cannot tell apart is told by refits
     "only the best is refitted": ([_gain(0.5), _zone(0.44)], {}, [GAIN], GAIN),
-    "even on the screen": ([_gain(0.5), _zone(0.46)], {"errors": {ZONE: 0.3}}, [GAIN, ZONE], ZONE),
     "even after the refit too": ([_gain(0.5), _zone(0.46)], {"errors": {ZONE: 0.49}}, [GAIN, ZONE], ZONE),
-    "a little less after the refit": ([_gain(0.5), _zone(0.46)], {"errors": {ZONE: 0.51}}, [GAIN, ZONE], GAIN),
     "another cause explaining the same": ([_gain(0.5), _spring(0.5)], {"errors": {HOOKE: 0.54}}, [GAIN, HOOKE], None),
     "another cause explaining less": ([_gain(0.5), _spring(0.5)], {"errors": {HOOKE: 0.56}}, [GAIN, HOOKE], GAIN),
     "the same cause": ([_gain(0.5), _zone(0.5)], {}, [GAIN, ZONE], GAIN),
     # the screen gives the second joint less than nine tenths of the first: refits decide at which joint it is
     "a law at its other joint": (
         [_gain(0.6), _gain(0.53, joint=2)], {"errors": (0.35, 0.27)}, [GAIN, GAIN], (GAIN, 2, None, ())),
-    "a law at its first joint": (
-        [_gain(0.6), _gain(0.53, joint=2)], {"errors": (0.27, 0.35)}, [GAIN, GAIN], (GAIN, 1, None, ())),
     # no more laws than the shortlist holds, and not after the time is up
     "a full shortlist": ([_screened(a, 0.5) for a in MANY],
         {"errors": {a.name: 0.99 for a in MANY}, "shortlist": 2}, [a.name for a in MANY[:2]], None),
@@ -310,11 +255,8 @@ ROUNDS = {  # what the screen says, options, the laws that are refitted in turn,
     "a law whose time is up": ([_gain(0.6), _zone(0.5)], {"errors": {GAIN: 0.99}, "late": 1}, [GAIN], None),
     # another start of a law that explains as much, by the step of each
     "another start": ([_gain(0.51), _gain(0.461, value=2.0)], {"steps": {2.0: 0.4, 1.0: 0.3}}, [GAIN], (GAIN, 2.0)),
-    "another start that explains less": (
-        [_gain(0.51), _gain(0.449, value=2.0)], {"steps": {2.0: 0.4, 1.0: 0.3}}, [GAIN], (GAIN, 1.0)),
-    "a start one part contradicts": ([_gain(0.56), OVERSHOT], {"steps": {2.0: 0.4, 1.0: 0.3}}, [GAIN], (GAIN, 2.0)),
-    "one that friction can imitate": (
-        [_gain(0.56), OVERSHOT._replace(survived=0.02)], {"steps": {2.0: 0.4, 1.0: 0.3}}, [GAIN], (GAIN, 1.0)),
+    "a start one part contradicts": (
+        [_gain(0.56), _gain(0.76, 2.0, folds=(0.9, 0.9, -0.2))], {"steps": {2.0: 0.4, 1.0: 0.3}}, [GAIN], (GAIN, 2.0)),
     "the best of a kind": ([_drag(0.1), _drag(0.4, 2.0), _drag(0.2, 3.0)], {}, [DRAG], (DRAG, 2.0)),
 }  # fmt: skip
 SAID = {  # of some of these rounds: fields of the step, as names of laws, with their numbers where they have some
@@ -350,17 +292,11 @@ def test_a_round(name):
 
 def test_suspects_are_near_the_best_and_over_chance_with_named_laws_first():
     """0.08 is less than 0.6 of the best; 0.10 is within twice a chance level of 0.055."""
-    for chance, names in ((0.0, [ZONE, GAIN, FREE]), (0.055, [ZONE, FREE]), (0.071, [])):
+    for chance, names in ((0.0, [ZONE, GAIN, FREE]), (0.055, [ZONE, FREE])):
         more = {"chance": chance, "folds": (0.2, 0.2, 0.2)}
         outcome, tried = _run([_free(0.14, **more), _zone(0.12, **more), _gain(0.10, **more), _drag(0.08, **more)])
         assert not tried and [suspect.key[0] for suspect in outcome.step.suspects] == names
         assert all(suspect.chance == chance for suspect in outcome.step.suspects)
-
-
-def test_a_band_shows_a_free_function_at_its_own_bar():
-    """At 1.2 times the bar of a named law at the longer horizons, and 4 times at the shorter ones."""
-    for law, band in ((_free, 1), (_spring, 0)):
-        assert max((law(0.18, band=0), law(0.6, band=1)), key=lambda s: s.rank).band == band
 
 
 def test_the_start_of_a_law_whose_step_removes_most_is_refitted_if_that_is_enough():
@@ -393,34 +329,27 @@ def test_a_law_of_a_rate_is_judged_by_that_reading_too():
         assert backward.judged_by(law, MODEL, RIG.measured, 2) == errors
 
 
-@pytest.mark.parametrize(
-    ("worth", "name", "same"),
-    [
-        (0.4, "air_drag", ("motor_gain",)),  # clearly less is no equivalent; one that was not fitted stays
-        (0.5, "air_drag", ("dead_zone", "motor_gain")),
-        (0.55, "air_drag", ("dead_zone", "motor_gain")),
-        (0.56, "dead_zone", ()),
-    ],
-)
-def test_what_explains_clearly_more_takes_the_place_of_a_law(worth, name, same):
-    """A law that removes half of the error gives way to one that removes more than ten ninths of that."""
-    zone, drag = _law("dead_zone"), _law("air_drag")
-    trial = Trial(_zone(worth), BARE.plus(zone, _candidate(zone)), worth, 12.0, np.inf)
-    evidence = Evidence(removed=0.5)._replace(equivalent=(key_of(zone), key_of(_law("motor_gain"))))
+def test_what_explains_clearly_more_takes_the_place_of_a_law():
+    """A law that removes half of the error gives way to one that removes more than ten ninths of that; clearly less is
+    no equivalent; one that was not fitted stays.
+    """
+    zone, drag, gain = map(_law, (ZONE, DRAG, GAIN))
+    evidence = Evidence(removed=0.5, equivalent=(key_of(zone), key_of(gain)))
     hypothesis = BARE.plus(drag, _candidate(drag), evidence)
-    after = backward.compared(hypothesis, lambda *_: [(trial, verdict.lead(0.5, worth))], lambda text: None)
-    assert _names(after.model) == [name]
-    assert after.evidence[0].equivalent == tuple(key_of(_law(each)) for each in same)
+    for worth, name, same in ((0.4, DRAG, (gain,)), (0.55, DRAG, (zone, gain)), (0.56, ZONE, ())):
+        trial = Trial(_zone(worth), BARE.plus(zone, _candidate(zone)), worth, 12.0, np.inf)
+        rivals = [(trial, verdict.lead(0.5, worth))]
+        after = backward.compared(hypothesis, lambda *_, rivals=rivals: rivals, lambda text: None)
+        assert _names(after.model) == [name]
+        assert after.evidence[0].equivalent == tuple(map(key_of, same))
 
 
 def test_rivals_of_a_law_are_its_equivalents_that_the_motion_shows_and_the_law_elsewhere():
     """A cogging of one period a turn may be a spring, where less than a turn was visited; a law alone was compared."""
     cogging = [catalogue["cogging"].of(0.1, 0.1, k, k, joint=1) for k in (1.0, 2.0)]
     springs = [dataclasses.replace(SPRING, joint=joint) for joint in (1, 2)]
-    every, evidence = (
-        [Candidate(law, (law,), law) for law in (*cogging, *springs)],
-        Evidence(equivalent=(key_of(cogging[0]),)),
-    )
+    every = [Candidate(law, (law,), law) for law in (*cogging, *springs)]
+    evidence = Evidence(equivalent=(key_of(cogging[0]),))
     for alone, laws in ((False, [cogging[1], springs[1]]), (True, [cogging[1]])):
         rivals = backward.rivals_of(SPRING, evidence, every, AROUND, alone=alone)
         assert [rival.start for rival in rivals] == laws
@@ -453,14 +382,10 @@ def _searched(monkeypatch, queue, needed=True, release=lambda fitted, data: fitt
     return search.search(CONTEXT._replace(**context), release=release)
 
 
-def _fails(fitted, data):
-    raise LOST
-
-
-LOST, LATE = np.linalg.LinAlgError("Singular matrix"), {"release": _fails}
+LOST = np.linalg.LinAlgError("Singular matrix")
+LATE = {"release": mock.Mock(side_effect=LOST)}
 LAW, OTHER = _law("motor_gain", 0.5), _law("air_drag", 0.5)
 SEARCHES = {  # rounds, options, the laws at the end, by round whether one was accepted, whether it ended
-    "until none is accepted": ((LAW, OTHER), {}, [GAIN, DRAG], [1, 1, 0], True),
     "accepted in every round, needless in every backward pass": ((LAW, None, LAW), {"needed": False}, [], [1, 0], True),
     "its time is up before the second screen": ((LAW, TimeUp()), {}, [GAIN], [1], False),
     "its time is up with candidates left": ((LAW, 3), {}, [GAIN], [1, 0], False),
@@ -524,14 +449,11 @@ def test_a_search_begins_at_the_whole_length_unless_most_sequences_are_lost_ther
         assert search.lengths_of(CONTEXT._replace(stages={4: (None, short), 9: (None, whole)})) == [first]
     long = Dataset(*(np.zeros((1, 500, *part.shape[2:])) for part in DATA[:3]), np.ones((1, 500), bool))
     hidden = BEFORE.state._replace(best=dataclasses.replace(MODEL, measured=(1,)))
-    for state, white, short, lengths in (
-        (hidden, True, [60, 96, 140], [60, 96, 246]),
-        (hidden, True, [60, 154], [60, 246]),
-        (hidden, False, [60, 96], [500]),
-        (BEFORE.state, True, [60, 96], [500]),
-    ):
-        stages, before = dict.fromkeys([*short, 246, 393, 500], (None, every)), BEFORE._replace(state=state)
-        context = CONTEXT._replace(stages=stages, data=long, white=white, before=before)
+    stages = dict.fromkeys([60, 96, 140, 246, 393, 500], (None, every))
+    for state, white, lengths in (
+        (hidden, True, [60, 96, 246]), (hidden, False, [500]), (BEFORE.state, True, [500]),
+    ):  # fmt: skip
+        context = CONTEXT._replace(stages=stages, data=long, white=white, before=BEFORE._replace(state=state))
         assert search.lengths_of(context) == lengths
 
 
@@ -553,11 +475,8 @@ def test_states_are_smoothed_and_predicted_by_the_branches_that_a_search_leaves_
 
 
 def test_no_step_begins_after_the_deadline():
-    count = []
-    toy = step(lambda: HERE)(lambda: count.append(1) or np.zeros(1))
+    toy = step(lambda: HERE)(lambda: np.zeros(1))
     with until(time.monotonic() + 3600):
         toy()
     with until(time.monotonic() - 1), pytest.raises(TimeUp):
         toy()
-    toy()
-    assert len(count) == 2

@@ -159,9 +159,6 @@ def test_a_placebo_keeps_a_column_s_numbers_and_loses_what_it_explains():
     moved = shifted(linearised, 1, rng)
     np.testing.assert_array_equal(moved.columns[..., 0], columns[..., 0])
     np.testing.assert_array_equal(moved.columns[:, 50:], columns[:, 50:])
-    for a, b in zip(moved.columns[:, :50, 0, 1], columns[:, :50, 0, 1], strict=True):
-        assert not np.array_equal(a, b)
-        np.testing.assert_array_equal(np.sort(np.abs(a)), np.sort(np.abs(b)))
     true, chance = _placebo(error[:, :50], columns[:, :50], rng)
     assert true == pytest.approx(0.32 / (0.32 + 0.36), abs=4 / np.sqrt(600))  # of the variance; its standard error
     assert chance < 4 / np.sqrt(600)
@@ -184,11 +181,8 @@ def test_a_placebo_moves_the_moments_that_count():
     before, after = columns[0, ::5, 0, 1], shifted(many, 1, np.random.default_rng(1)).columns[0, ::5, 0, 1]
     np.testing.assert_allclose(np.sort(np.abs(before)), np.sort(np.abs(after)))
     assert not np.any(np.isclose(before, after))
-    columns = np.arange(1.0, 13.0).reshape(1, 3, 1, 4)
-    few = Linearised(np.zeros((1, 3, 1)), columns, np.ones((1, 3, 1)), 1.0, np.arange(3))
-    moved = shifted(few, 1, np.random.default_rng(0)).columns
-    np.testing.assert_array_equal(moved[..., :1], columns[..., :1])
-    assert not moved[..., 1:].any()
+    few = Linearised(np.zeros((1, 3, 1)), columns[:, :3], np.ones((1, 3, 1)), 1.0, np.arange(3))
+    assert not shifted(few, 1, np.random.default_rng(0)).columns[..., 1:].any()
 
 
 def test_logs_too_short_for_a_fork_say_nothing():

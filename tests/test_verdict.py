@@ -54,27 +54,25 @@ def test_the_simplest_law_counts_that_explains_nine_tenths_of_the_best():
 SOUND = {"possible": True, "certainty": 12.0, "amplitude": math.inf, "removed": 0.2, "floor": 0.15, "complexity": 0}
 VETOES = [
     ({}, None),
-    ({"possible": False}, "impossible"),
+    ({"possible": False}, "without physical meaning"),
     ({"certainty": 5.1}, None),
-    ({"certainty": 4.9}, "uncertain"),
-    ({"certainty": math.nan}, "uncertain"),
+    ({"certainty": 4.9}, "from none"),
+    ({"certainty": math.nan}, "from none"),
     ({"amplitude": 2.1}, None),
-    ({"amplitude": 1.9}, "undetermined"),  # an amplitude of 0.20 +- 0.83 is no ripple
+    ({"amplitude": 1.9}, "an amplitude of 1.9"),  # an amplitude of 0.20 +- 0.83 is no ripple
     ({"removed": 0.09}, None),
-    ({"removed": 0.089}, "small"),
-    ({"removed": math.nan}, "small"),
+    ({"removed": 0.089}, "removes"),
+    ({"removed": math.nan}, "removes"),
     ({"removed": 0.03, "floor": 0.04}, None),
     ({"removed": 0.151, "complexity": 1}, None),
-    ({"removed": 0.149, "complexity": 1}, "small"),  # many numbers fit many things a little
+    ({"removed": 0.149, "complexity": 1}, "removes"),  # many numbers fit many things a little
 ]
 
 
 def test_a_refit_vetoes_what_is_impossible_uncertain_or_small():
     for numbers, code in VETOES:
         reason = verdict.veto(**(SOUND | numbers))
-        assert (reason and reason.code) == code, numbers
-        assert reason is None or reason.sentence
-    assert {code for _, code in VETOES} - {None} | {"before"} == set(verdict.REASONS)
+        assert (reason is None) == (code is None) and (code or "") in (reason or ""), numbers
     # what is lost without an effect is most of the floor
     assert verdict.needed(0.09, 0.15) and not verdict.needed(0.0899, 0.15) and not verdict.needed(math.nan, 0.15)
 

@@ -21,8 +21,8 @@ from nnap_em.data.machine import Machine, unpacked
 from nnap_em.data.rig import Declared, Rig, read_rig
 from nnap_em.effects.actuator import ActuatorLag, Saturation
 from nnap_em.effects.body import Payload
+from nnap_em.effects.friction import BackEmf
 from nnap_em.effects.position import Cogging, TorsionalSpring
-from nnap_em.effects.rate import BackEmf
 from nnap_em.export.friction import FrictionForm, friction_form
 from nnap_em.export.mjcf import as_it_is, write_mjcf
 from nnap_em.export.model import ExportError, write_model

@@ -21,7 +21,7 @@ from .rounds import best_of_kind
 from .screen import screen
 from .smoothed import SmoothedFit
 from .trial import Null, Trial, null_of, with_candidate
-from .verdict import KEEP, MULTI_STEP, Rejection, lead, needed
+from .verdict import IMPOSSIBLE, KEEP, MULTI_STEP, lead, needed
 
 
 class _Reduced(NamedTuple):
@@ -51,7 +51,7 @@ def backward(context: SearchContext, hypothesis: Hypothesis) -> Hypothesis:
             return compared(hypothesis, functools.partial(_in_place, context, full, reduced), context.log)
         lost = reduced[least].lost
         reason = f"without it {share_of(lost, 'the squared error', 1)} is lost, {KEEP * MULTI_STEP:.1%} counts"
-        reason = reason if lost > -math.inf else Rejection("impossible").sentence
+        reason = reason if lost > -math.inf else IMPOSSIBLE
         context.log(f"  {words(key_of(hypothesis.model.effects[least]))} is removed: {reason}")
         hypothesis = hypothesis.without(least)
     return hypothesis

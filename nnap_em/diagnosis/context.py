@@ -7,11 +7,14 @@ from typing import Any, NamedTuple, cast
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy import stats
 
 from ..data.dataset import Dataset, horizon
+from ..effects import Candidate
+from ..effects.sensor import SensorQuantization, grid_step
 from ..em.loop import SCHEDULE, EMState, FitError, Schedule, e_step, fit, later_state, start_state
 from ..em.mstep import not_diverged
 from ..em.multistep import JUDGED, LEAST_FALL, errors, followed, ratio
@@ -20,10 +23,10 @@ from ..fit.identify import Identified, begin
 from ..model.state_space import StateSpaceModel
 from ..numerics.digits import counted
 from ..storage.log import Log
-from .hypothesis import Hypothesis, declared
+from .hypothesis import Evidence, Hypothesis, declared
 from .losses import MultiStep
 from .smoothed import SmoothedFit
-from .verdict import DETERMINED
+from .verdict import COARSE, DETERMINED, FINEST
 
 Stages = dict[int, tuple[EMState, Bool[np.ndarray, " seq"]]]
 """State of a fit at the end of each of its horizons, and the sequences used."""
@@ -204,3 +207,31 @@ def ahead(a: Float[np.ndarray, " seq"], b: Float[np.ndarray, " seq"]) -> float:
     gain = np.sort(np.nan_to_num(a, nan=-1e3) - np.nan_to_num(b, nan=-1e3))
     cut = gain.size // 6
     return float(np.mean(gain[cut : gain.size - cut]) * gain.size)
+
+
+def quantised(context: SearchContext, hypothesis: Hypothesis) -> tuple[Hypothesis, EMState | None]:
+    """Readings that come in steps larger than their noise: seen in the numbers themselves, modelled as noise.
+
+    A fit that took the steps for motion has lost its way: it begins again where it was short.
+    """
+    rig, state, first = context.before.rig, None, min(context.stages)
+    certain = 12.0  # gain in log-likelihood [nat] below which steps are no effect: chance exceeds it once in 10^6
+    for i, channel in enumerate(rig.measured):
+        y = np.asarray(context.data.y)[..., i]
+        step = grid_step(y.ravel())
+        model = cast(StateSpaceModel, state.best if state else hypothesis.model)
+        declared, estimated = rig.noise_std.get(channel), float(jnp.exp(model.log_r[i]))
+        share = step**2 / 12 / (declared**2 if declared else max(estimated - step**2 / 12, FINEST * estimated))
+        gain = 0.5 * np.isfinite(y).sum() * (share - math.log1p(share))  # of the right variance over that without it
+        if share < COARSE or gain < certain:
+            continue
+        context.log(f"  {channel} comes in steps of {step:.4g}")
+        effect, spread = (SensorQuantization(step=jnp.asarray(s), channel=channel) for s in (step, 1e-3 * step))
+        early = cast(StateSpaceModel, state.best if state else context.stages[first][0].best)
+        candidate = Candidate(effect, (effect,), spread)
+        hypothesis = hypothesis.refitted(early).plus(effect, candidate, Evidence(float(gain)))
+        if declared:
+            log_r = hypothesis.model.log_r.at[i].set(math.log(declared**2 + step**2 / 12))
+            hypothesis = hypothesis.refitted(eqx.tree_at(lambda m: m.log_r, hypothesis.model, log_r))
+        state = extend(context, hypothesis, first)
+    return hypothesis, state

@@ -17,6 +17,7 @@ from .hypothesis import covariances
 from .keys import Key, key_of, listed, place_of, remainder_of, with_article, words
 from .outcome import Diagnosis
 from .shapes import Shape, shape
+from .verdict import RISEN
 
 
 class Estimate(NamedTuple):
@@ -91,14 +92,9 @@ def findings(diagnosis: Diagnosis) -> list[Finding]:
         if remainder is not None and remains is not None:
             left = f"{np.ptp(remainder.mean):.2g} {remainder.unit}: {remains.words}"
             sentence += f"; the law is not quite of this form, what is left has {left}"
-        evidence = {
-            "log_likelihood_gain": record.gain,
-            "p_value": math.nan,  # of a search by likelihood, as the next: files keep their keys
-            "held_out_gain": math.nan,
-            "share_of_error": record.share,
-            "chance": record.chance,
-            "parts": list(record.parts),
-        }
+        none = dict.fromkeys(("p_value", "held_out_gain"), math.nan)  # of a search by likelihood: files keep their keys
+        found = {"share_of_error": record.share, "chance": record.chance, "parts": list(record.parts)}
+        evidence = {"log_likelihood_gain": record.gain} | none | found
         beside = drawn is None and remainder is not None
         equivalent = tuple(dict.fromkeys([*effect.same_as(model.system, fitted.rig.measured), *record.equivalent]))
         one = Finding(effect, parameters, evidence, equivalent, sentence, drawn or remainder, form or remains, beside)
@@ -133,10 +129,8 @@ def verdict(
         others = f" ({len(remaining)} more below)" if remaining else ""
         return f"No effect is certain to be missing. Suspected: {first.description}{others}."
     if not accepted and failed:
-        return (
-            "No single effect of the catalogue is certain to be missing, but the declared model does not explain "
-            f"everything: {failed} tests of its one-step errors fail."
-        )
+        none = "No single effect of the catalogue is certain to be missing, but the declared model does not explain"
+        return f"{none} everything: {failed} tests of its one-step errors fail."
     if not accepted:
         return "Nothing is missing that these data could show: the declared model explains them."
     names, it = listed([_sized(finding) for finding in accepted]), "it" if len(accepted) == 1 else "them"
@@ -148,15 +142,37 @@ def verdict(
     ratios = [(c, error["before"][c][at], error["after"][c][at]) for c in sorted(grows, key=grows.__getitem__)]
     if sum(grows.values()) >= 0:
         column, before, after = ratios[-1]
-        return (
-            f"The training data support {names}, but on test data the {horizon} prediction error of {column} does not "
-            f"fall with {it} ({before:.3g} before, {after:.3g} after): do not trust it."
-        )
+        stays = f"the {horizon} prediction error of {column} does not fall with {it}"
+        numbers = f"({before:.3g} before, {after:.3g} after)"
+        return f"The training data support {names}, but on test data {stays} {numbers}: do not trust it."
     column, before, after = ratios[0]
     rising = [f"that of {c} rises from {b:.3g} to {a:.3g}" for c, b, a in ratios[1:] if a > b]
     of = "error of a free simulation" if "judged_s" in error else f"{horizon} prediction error"
     falls = f"the {of} of {column} falls from {before:.3g} to {after:.3g}"
     return f"{text}; with {it} {listed([falls, *rising])} on test data."
+
+
+def changes(diagnosis: Diagnosis, accepted: Sequence[Finding], error: Mapping[str, Any] | None = None) -> str:
+    """The outcome of a search that began from a fit in one sentence: what changed since, or that nothing did, with the
+    test of whether errors have risen.
+    """
+    if not diagnosis.complete:
+        first = changes(diagnosis._replace(complete=True), accepted, error)
+        return f"{first} {diagnosis.unfinished}: more may have changed."
+    if accepted:
+        return verdict(accepted, error, opening="Changed since the fit:")
+    test, rivals = diagnosis.risen, listed([*map(words, undecided(diagnosis))])
+    tied = f" {rivals[0].upper()}{rivals[1:]} explain the same; none is added." if rivals else ""
+    also = tied or "".join(f" Suspected: {suspect.description}." for suspect in suspected(diagnosis)[:1])
+    none = "Nothing is certain to have changed since the fit"
+    if test is None:
+        return f"{none}, whose own recordings are not at hand.{also}"
+    size = f"errors are {number(test.ratio, 2)} times those on its recordings left out (p = {number(test.p_value, 2)})"
+    if test.p_value < RISEN:
+        return f"Something changed since the fit, and no law and no number is certain to explain it: {size}.{also}"
+    if test.least >= RISEN:
+        return f"{none}, and so few recordings cannot show it by errors: {size}.{also}"
+    return f"{none if tied else 'Nothing changed since the fit that these recordings could show'}: {size}.{tied}"
 
 
 def growth(error: Mapping[str, Any]) -> dict[str, float]:
@@ -203,7 +219,6 @@ class SuspectReport(NamedTuple):
     law: str
     description: str
     confirm: str
-    """An experiment that would show it."""
 
 
 def suspected(diagnosis: Diagnosis) -> list[SuspectReport]:

@@ -27,40 +27,25 @@ def surroundings(
     """
     free = {name: float(d.mean) for name, d in rig.bodies.items() if d.std > 0}
     moved = tuple((name, rig.unit(name), abs(value) or 1.0) for name, value in free.items())
-    scales = measure_scales(rig, model.system, data)
-    dof = len(model.system.coordinates)
-    valid = np.asarray(data.valid)
-    mean = np.asarray(path.mean)[valid & np.isfinite(np.asarray(path.mean)).all(-1)]
+    scales, dof = measure_scales(rig, model.system, data), len(model.system.coordinates)
+    y, valid = np.asarray(data.y), np.asarray(data.valid)
+    mean, clock = np.asarray(path.mean)[valid & np.isfinite(np.asarray(path.mean)).all(-1)], np.asarray(data.t)[valid]
     low, high = np.percentile(mean[:, :dof], [0.5, 99.5], axis=0)
-    y = np.asarray(data.y)
-    clock = np.asarray(data.t)[valid]
     drive = np.nan_to_num(np.asarray(each(_drives, with_effects(model, ()), (path.mean, data))))
+    drive = np.max(np.abs(np.where(valid[..., None], drive, 0.0)), axis=(0, 1), initial=0.0)
     speed = np.percentile(np.abs(mean[:, dof : 2 * dof]), 99.5, axis=0) + 1e-9
     ends = jnp.asarray(np.outer([1.0, 0.4, -0.4, -1.0], speed))
     fast, slow, back, fast_back = np.asarray(_torques(model.unknown, ends))
     # what rises between 0.4 and 1 of the top speed, on both sides, is not dry friction any more: the viscous slope
     viscous = np.maximum(0.0, -((fast - fast_back) - (slow - back)) / (1.2 * speed))
+    ending = float(clock.max()) + rig.dt * (rows - int(valid.sum(axis=1).max()))
     return SearchScales(
-        model.system,
-        scales.torque,
-        speed,
-        viscous,
-        low,
-        high,
-        np.max(np.abs(np.where(valid[..., None], drive, 0.0)), axis=(0, 1), initial=0.0)[
-            [joint - 1 for joint in model.system.joints]
-        ],
-        rig.measured,
-        np.asarray([np.nanstd(y[..., i]) + 1e-9 for i in range(y.shape[-1])]),
-        rig.dt,
-        (float(clock.min()), float(clock.max())),
-        float(clock.max()) + rig.dt * (rows - int(valid.sum(axis=1).max())),
-        rig.clock == "session",
-        rig.friction,
-        rig.input_columns,
+        model.system, scales.torque, speed, viscous, low, high, drive[[joint - 1 for joint in model.system.joints]],
+        rig.measured, np.asarray([np.nanstd(y[..., i]) + 1e-9 for i in range(y.shape[-1])]), rig.dt,
+        (float(clock.min()), float(clock.max())), ending, rig.clock == "session", rig.friction, rig.input_columns,
         moved=moved if change else None,
         dry=np.maximum(0.5 * np.abs(slow - back) - 0.4 * viscous * speed, 0.01 * scales.torque),
-    )
+    )  # fmt: skip
 
 
 def _drives(plain: StateSpaceModel, one) -> Float[Array, "time dof"]:
@@ -71,7 +56,6 @@ def _drives(plain: StateSpaceModel, one) -> Float[Array, "time dof"]:
 
 @eqx.filter_jit
 def _torques(unknown, v: Float[Array, "node dof"]) -> Float[Array, "node dof"]:
-    """Torques of the friction map at joint velocities."""
     return jax.vmap(unknown)(v)
 
 

@@ -192,7 +192,7 @@ def _log(case: Trial, context: SearchContext) -> None:
         f"  {text}; {bar}; not refitted" if case.refit is None else f"  refitted {text}, {after} after it; {bar}"
     )
     if case.refit is not None and (reason := case.rejection):
-        context.log(f"  {name} {reason.sentence}")
+        context.log(f"  {name} {reason}")
 
 
 def _removals(tried: Sequence[Trial]) -> tuple[tuple[Key, float], ...]:

@@ -29,18 +29,17 @@ from ..smoother.start import StartBank
 from ..storage.deadline import TimeUp, until
 from ..storage.log import Log, silent
 from .backward import backward
-from .context import SHORT, SearchContext, Stages, extend, smooth
+from .context import SHORT, SearchContext, Stages, extend, quantised, smooth
 from .equations import search_equations
 from .hypothesis import Evidence, Hypothesis, covariances
 from .interventions import Intervention, interventions
 from .keys import Key, key_of, remainder_of, replaced, words
 from .losses import MultiStep
 from .outcome import Diagnosis, Step, Suspect
-from .quantised import quantised
 from .rounds import screening_round
 from .smoothed import along, risen_since
 from .trial import Trial, certainty
-from .verdict import DETERMINED, FOLLOWED, HELD, Rejection, even
+from .verdict import DETERMINED, FOLLOWED, HELD, UNCERTAIN, even
 
 FAILURES = (ArithmeticError, ValueError, RuntimeError)
 """Numerical failures: those of NumPy and SciPy are ValueErrors, those of JAX and `FitError` RuntimeErrors."""
@@ -132,7 +131,7 @@ def _determined(
         if least is None:
             return hypothesis, outcome, steps
         law, evidence = key_of(model.effects[least]), cast(Evidence, found[least])
-        context.log(f"  {words(law)} is removed: it {Rejection('uncertain', sure[least]).sentence}")
+        context.log(f"  {words(law)} is removed: it {UNCERTAIN.format(sure[least])}")
         steps = [step._replace(accepted=None) if step.accepted == law else step for step in steps]
         suspects = Suspect(law, evidence.share, evidence.chance), *steps[-1].suspects
         steps[-1] = steps[-1]._replace(suspects=suspects)
@@ -356,10 +355,6 @@ def unbranched(bank: StartBank) -> GaussianSmoother:
 
 def branching(diagnosis: Diagnosis) -> Diagnosis:
     """The outcome with the smoother of `identify`, by which states are smoothed and predicted."""
-
-    def branched(fit: Identified) -> Identified:
-        return fit._replace(smoother=CubatureSmoother(fit.bank))
-
-    before = branched(diagnosis.before)
-    after = before if diagnosis.after is diagnosis.before else branched(diagnosis.after)
-    return diagnosis._replace(before=before, after=after)
+    both = diagnosis.before, diagnosis.after
+    before, after = (fit._replace(smoother=CubatureSmoother(fit.bank)) for fit in both)
+    return diagnosis._replace(before=before, after=before if both[0] is both[1] else after)

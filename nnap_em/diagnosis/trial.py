@@ -18,7 +18,7 @@ from .propose import seeded
 from .refit import Refit, refit
 from .screen import Screened
 from .smoothed import SmoothedFit, extended
-from .verdict import Rejection, foreseen, veto
+from .verdict import foreseen, veto
 
 
 class Trial(NamedTuple):
@@ -51,7 +51,7 @@ class Trial(NamedTuple):
         return self.after.model.effects[-1]
 
     @property
-    def rejection(self) -> Rejection | None:
+    def rejection(self) -> str | None:
         """Reason against it; None where there is none."""
         numbers = {name: getattr(self, name) for name in ("certainty", "amplitude", "removed", "before")}
         possible, count = self.effect.is_physical(), complexity(self.effect)

@@ -1,10 +1,8 @@
 """Numbers that decide whether an effect enters a model or leaves it, and the decisions.
 
 The search measures; this file decides.  A share is the part of a squared error that a candidate removes [0 to 1].
-Elsewhere: READINGS (`em/noise.py`), which chooses the horizons where a joint is hidden; the bars of tests
-(`statistics.py`), of external disturbances (`interventions.py`) and of the shape of a curve
-(`shapes.py`); and counts of parts, placebos, laws and passes (`screen.py rounds.py refit.py context.py columns.py
-search.py equations.py`).
+Elsewhere: READINGS (`em/noise.py`), the bars of `statistics.py`, `interventions.py` and `shapes.py`; and counts of
+parts, placebos, laws and passes, each where it counts.
 """
 
 import math
@@ -134,27 +132,12 @@ def simplest(values: Sequence[float], complexities: Sequence[int], ties: Sequenc
     return min(even(values), key=lambda i: (complexities[i], -ties[i]))
 
 
-class Rejection(NamedTuple):
-    """Reason against a refitted effect, as data."""
-
-    code: str
-    value: float = math.nan
-
-    @property
-    def sentence(self) -> str:
-        """The reason as a clause whose subject is the effect."""
-        shares = ("small", "before")
-        value = share_of(self.value, "the squared error", 1) if self.code in shares else self.value
-        return REASONS[self.code].format(value)
-
-
-REASONS = {
-    "impossible": "has a value without physical meaning after its refit",
-    "uncertain": "is {:.1f} standard deviations from none after its refit",
-    "undetermined": "has an amplitude of {:.1f} standard deviations after its refit",
-    "small": "removes {} after its refit",
-    "before": "explains the recordings of the fit as well, of which it removes {}: it is missing there, and no change",
-}
+IMPOSSIBLE = "has a value without physical meaning after its refit"
+UNCERTAIN = "is {:.1f} standard deviations from none after its refit"
+UNDETERMINED = "has an amplitude of {:.1f} standard deviations after its refit"
+SMALL = "removes {} after its refit"
+BEFORE = "explains the recordings of the fit as well, of which it removes {}: it is missing there, and no change"
+"""Reasons against a refitted effect, as clauses whose subject it is."""
 
 
 def veto(
@@ -166,7 +149,7 @@ def veto(
     floor: float,
     complexity: int,
     before: float = -math.inf,
-) -> Rejection | None:
+) -> str | None:
     """Reason against an effect after its refit, None where there is none.
 
     `certainty` is the Wald statistic of its strengths, `amplitude` that of its reported amplitude (infinite without
@@ -174,15 +157,16 @@ def veto(
     `complexity` that of the law, `before` the share that it removes from the recordings of an earlier fit: a law that
     counts there as well is missing, and no change.
     """
+    least = required(floor, complexity)
     if not possible:
-        return Rejection("impossible")
+        return IMPOSSIBLE
     if not certainty > CERTAIN:
-        return Rejection("uncertain", certainty)
+        return UNCERTAIN.format(certainty)
     if not amplitude > DETERMINED:
-        return Rejection("undetermined", amplitude)
-    if not needed(removed, required(floor, complexity)):
-        return Rejection("small", removed)
-    return Rejection("before", before) if needed(before, required(floor, complexity)) else None
+        return UNDETERMINED.format(amplitude)
+    if not needed(removed, least):
+        return SMALL.format(share_of(removed, "the squared error", 1))
+    return BEFORE.format(share_of(before, "the squared error", 1)) if needed(before, least) else None
 
 
 def needed(share: float, floor: float) -> bool:

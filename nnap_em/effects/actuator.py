@@ -82,7 +82,6 @@ class Saturation(InputEffect):
         "Block the joint and raise the command until the torque stays the same; look at the drive's current limit."
     )
     units: ClassVar[dict[str, str]] = {"limit": "N m"}
-    words: ClassVar[dict[str, str]] = {"limit": "limit"}
     above_zero: ClassVar[str] = "limit"
     linear: ClassVar[bool] = False
     limit: Scalar

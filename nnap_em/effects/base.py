@@ -47,8 +47,8 @@ class SearchScales(NamedTuple):
     viscous: Float[np.ndarray, " dof"]
     """Slope of the learned friction map at speed [N m s/rad]."""
     low: Float[np.ndarray, " dof"]
-    """Smallest and largest coordinate on the smoothed paths [rad]."""
     high: Float[np.ndarray, " dof"]
+    """Smallest and largest coordinate on the smoothed paths [rad]."""
     drive: Float[np.ndarray, " input"]
     """Largest torque of every input [N m]."""
     measured: tuple[str, ...]
@@ -67,9 +67,8 @@ class SearchScales(NamedTuple):
     inputs: tuple[str, ...]
     """Column of every input."""
     sizes: Mapping[str, tuple[float, float]] = {}
-    """Ranges of states and inputs, of equations."""
     ends: Mapping[str, tuple[float, float]] = {}
-    """Ranges of the readings, of equations."""
+    """Ranges of states and inputs, and of the readings, of equations."""
     moved: tuple[tuple[str, str, float], ...] | None = None
     """Estimated numbers of the machine with unit and size, where the question is what changed since a fit."""
     dry: Float[np.ndarray, " dof"] = np.zeros(0)
@@ -79,11 +78,6 @@ class SearchScales(NamedTuple):
     def ordered(self) -> list[tuple[str, str]]:
         """Pairs of different states that are open ports, in either order."""
         return list(itertools.permutations([name for name in self.system.open_ports if name in self.system.states], 2))
-
-    @property
-    def pairs(self) -> list[tuple[str, str]]:
-        """Pairs of different states of equations."""
-        return [pair for pair in self.ordered if pair[0] < pair[1]]
 
     @property
     def joints(self) -> range:
@@ -116,7 +110,6 @@ class SearchScales(NamedTuple):
 
 @eqx.filter_jit
 def _still(system: Any) -> Float[Array, " dof"]:
-    """Inertia behind every joint with all joints at zero."""
     return jnp.diagonal(system.mass(jnp.zeros(len(system.coordinates))))
 
 
@@ -342,12 +335,7 @@ def input_of(joint: int | None) -> str:
 
 def known(**options):
     """A field with a number that no fit moves; an array all the same, so that another number is no other program."""
-    return eqx.field(converter=_array, metadata={"known": True}, **options)
-
-
-def _array(value: Any) -> Any:
-    """Numbers of any shape as an array of the default precision."""
-    return jnp.asarray(value, float)
+    return eqx.field(converter=a, metadata={"known": True}, **options)
 
 
 def fields(effect: AbstractEffect) -> tuple[str, ...]:
@@ -365,8 +353,8 @@ def one(
     make: Callable[..., AbstractEffect], none: float, probe: float, spread: float, *inner: tuple[float, float]
 ) -> Candidate:
     """A candidate of one strength: no effect, a small one, its prior standard deviation; `inner` as in `pair`."""
-    at, wide = [a(value) for value, _ in inner], [a(std) for _, std in inner]
-    return Candidate(make(a(none), *at), (make(a(probe), *at),), make(a(spread), *wide))
+    start, small, wide = ([a(n), *(a(number[i]) for number in inner)] for i, n in ((0, none), (0, probe), (1, spread)))
+    return Candidate(make(*start), (make(*small),), make(*wide))
 
 
 def pair(make: Callable[..., AbstractEffect], probe: float, spread: float, *inner: tuple[float, float]) -> Candidate:
@@ -385,6 +373,6 @@ def contact(deep: Scalar, rate: Scalar, stiffness: Scalar, damping: Scalar, edge
     return jnp.where(deep > 0, jnp.maximum(push, 0.0), jnp.minimum(push, 0.0))
 
 
-def a(value: float | Scalar) -> Scalar:
-    """A number as an array of the default precision."""
+def a(value: Any) -> Any:
+    """Numbers of any shape as an array of the default precision."""
     return jnp.asarray(value, float)

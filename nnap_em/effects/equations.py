@@ -57,6 +57,11 @@ class Flow(AbstractEffect):
         return self.strength * (self.kind @ forms) * (self.source + self.share * self.target)
 
 
+def _one_of(names: Sequence[str], name: str | None) -> Float[Array, " name"]:
+    """1 at the place of a name, else 0."""
+    return a([float(other == name) for other in names])
+
+
 class PortEffect(AbstractEffect):
     """A law of some signals at a port, or from one to another."""
 
@@ -79,17 +84,10 @@ class PortEffect(AbstractEffect):
     edge: Any = known(kw_only=True, default=0.0)
 
     def lean(self, system) -> Flow:
-        """The law as the formula of all."""
-        signals, ports = (*system.states, *system.inputs), system.ports
-
-        def one_of(names: tuple[str, ...], name: str | None) -> Float[np.ndarray, " name"]:
-            return np.asarray([float(other == name) for other in names])
-
-        first, second = (one_of(signals, (*self.reads, None, None)[i]) for i in (0, 1))
-        source = (-1.0 if self.leaves else 1.0) * one_of(ports, self.channel)
-        target = (1.0 if self.leaves else -1.0) * one_of(ports, self.to)
+        signals, ports, way = (*system.states, *system.inputs), system.ports, -1.0 if self.leaves else 1.0
+        first, second = (_one_of(signals, (*self.reads, None, None)[i]) for i in (0, 1))
+        source, target = way * _one_of(ports, self.channel), -way * _one_of(ports, self.to)
         kind = np.eye(len(FORMS))[self.kind]
-        kind, first, second, source, target = (jnp.asarray(a, float) for a in (kind, first, second, source, target))
         return Flow(self.strength, self.level, self.share, kind, first, second, source, target, self.edge)
 
     def force(self, scene, memory):
@@ -103,7 +101,6 @@ class PortEffect(AbstractEffect):
         return {name: getattr(self, name) for name in self.reports}
 
     def units_on(self, system):
-        """Those of its port and signals."""
         signals = [system.unit(name) for name in self.reads]
         port = system.port_unit(system.ports.index(self.channel) + 1)
         per = [[], signals[:1], signals[:1], signals[:2], signals[:1] * 2, signals[:1], signals[1:2]][self.kind]
@@ -114,9 +111,8 @@ class PortEffect(AbstractEffect):
         return {"strength": strength, "level": signals[0] if signals else "", "share": "-"}
 
     def phrase(self, sizes):
-        """A flow with its signals, level and share, in words."""
-        source = f"out of {self.channel}" if self.leaves else f"into {self.channel}"
-        way = f"from {self.channel} to {self.to}" if self.to else source
+        out = "out of" if self.leaves else "into"
+        way = f"from {self.channel} to {self.to}" if self.to else f"{out} {self.channel}"
         form = FORMS[self.kind].format(*self.reads)
         level = f" above {self.reads[0]} = {sizes['level']}" if "level" in sizes else ""
         share = f" (share {sizes['share']})" if "share" in sizes else f" ({sizes['strength']})"
@@ -232,7 +228,7 @@ class Exchange(PortEffect):
 
     @classmethod
     def places(cls, around):
-        return [(one, (one, other), other) for one, other in around.pairs]
+        return [(one, (one, other), other) for one, other in around.ordered if one < other]
 
 
 class Transfer(PortEffect):
@@ -298,11 +294,9 @@ def _grid(values: Float[Array, " axis"], low: Any, high: Any) -> Float[Array, " 
     """Gaussian basis functions of a grid between `low` and `high`; beyond the ends those of the end."""
     count, out = NODES[values.shape[0]], jnp.ones(1, values.dtype)
     for i in range(values.shape[0]):
-        centres = jnp.linspace(low[i], high[i], count)
-        inside = jnp.clip(values[i], low[i], high[i])
-        out = (
-            out[:, None] * jnp.exp(-0.5 * ((inside - centres) * (count - 1) / (high[i] - low[i])) ** 2)[None]
-        ).ravel()
+        away = jnp.clip(values[i], low[i], high[i]) - jnp.linspace(low[i], high[i], count)
+        bells = jnp.exp(-0.5 * (away * (count - 1) / (high[i] - low[i])) ** 2)
+        out = (out[:, None] * bells[None]).ravel()
     return out
 
 
@@ -363,10 +357,6 @@ class UnknownTerm(AbstractEffect):
         """Basis functions of the grid at values of the signals; beyond the ends those of the end."""
         return _grid(values, self.low, self.high)
 
-    def at(self, values: Float[Array, " axis"]) -> Scalar:
-        """The function at values of its signals."""
-        return _function(self.weights @ self.basis, values, self.low, self.high)
-
     def table(self, cov: Float[np.ndarray, "basis basis"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Places over the ranges of its signals (place, signal), the function there, and its standard deviation."""
         count = 2 * NODES[len(self.reads)] - 1
@@ -380,10 +370,8 @@ class UnknownTerm(AbstractEffect):
 
     def lean(self, system):
         nodes, numbers = self.basis.shape[1], self.weights.shape[0]
-        signals = (*system.states, *system.inputs)
-        fill = [(0, nodes - numbers)]
-        pick = np.asarray([[float(name == other) for other in signals] for name in self.reads])
-        at = np.asarray([float(name == self.channel) for name in system.ports])
+        signals, fill = (*system.states, *system.inputs), [(0, nodes - numbers)]
+        pick, at = np.asarray([_one_of(signals, name) for name in self.reads]), _one_of(system.ports, self.channel)
         basis = jnp.pad(jnp.asarray(self.basis), [*fill, (0, 0)])
         return FreeFlow(jnp.pad(self.weights, fill, constant_values=1.0), basis, self.low, self.high, pick, at)
 

@@ -1,4 +1,4 @@
-"""Friction that changes: with the position, with time, with the load."""
+"""Forces of the velocity: drag, friction that changes with position, time and load, friction with memory."""
 
 import math
 from dataclasses import replace
@@ -6,10 +6,11 @@ from functools import partial
 from typing import ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .base import Candidate, JointEffect, Scalar, a, fields, input_of, known, one, pair
+from .base import AbstractEffect, Candidate, JointEffect, Scalar, a, fields, input_of, known, one, pair
 
 
 class PositionDependentFriction(JointEffect):
@@ -198,3 +199,113 @@ def _grown(old: LoadFriction, start: LoadFriction, size: float = 1.0) -> Candida
     if start.log_velocity is not None:
         wide["log_velocity"] = a(0.7)
     return Candidate(start, probes, replace(start, **wide))  # pyrefly: ignore[bad-argument-type]  (numbers)
+
+
+class AirDrag(AbstractEffect):
+    """-c |w| w at a joint, or the drag of a point at the tip (joint None)."""
+
+    name: ClassVar[str] = "air_drag"
+    meaning: ClassVar[str] = "A brake that grows with the square of speed, as air does."
+    confirm: ClassVar[str] = "Swing once with the tip shrouded, or once slow and once fast."
+    units: ClassVar[dict[str, str]] = {"c": "N m s^2/rad^2"}
+    words: ClassVar[dict[str, str]] = {"c": "drag coefficient"}
+    units_free: ClassVar[dict[str, str]] = {"c": "N s^2/m^2"}
+    above_zero: ClassVar[str] = "c"
+    c: Scalar
+
+    @classmethod
+    def candidates(cls, around):
+        sizes = [float(size) for size in around.torque / around.speed**2]
+        out = [one(partial(cls, joint=j), 0.0, 0.1 * size, size) for j, size in zip(around.joints, sizes, strict=True)]
+        tip = around.system.tip(jnp.zeros(len(sizes)))
+        return out if tip is None else [*out, one(cls, 0.0, sizes[-1], 100 * sizes[-1])]
+
+    def force(self, scene, memory):
+        if self.joint is not None:
+            v = scene.v[self.joint - 1]
+            return jnp.zeros_like(scene.v).at[self.joint - 1].set(-self.c * jnp.abs(v) * v)
+        jac = jax.jacfwd(scene.system.tip)(scene.q)
+        speed = jac @ scene.v
+        return -self.c * jac.T @ (speed * jnp.sqrt(jnp.sum(speed**2) + 1e-12))
+
+
+class BackEmf(JointEffect):
+    """The motor's torque falls by b w; a learned friction map holds it."""
+
+    name: ClassVar[str] = "motor_back_emf"
+    meaning: ClassVar[str] = "The torque of the motor falls with its speed."
+    confirm: ClassVar[str] = "Log the motor current beside the command."
+    units: ClassVar[dict[str, str]] = {"b": "N m s/rad"}
+    words: ClassVar[dict[str, str]] = {"b": "torque lost per speed"}
+    b: Scalar
+
+    @classmethod
+    def candidates(cls, around):
+        sizes = ((j, float(around.torque[j - 1] / around.speed[j - 1])) for j in around.system.joints)
+        return [one(partial(cls, joint=j), 0.0, 0.1 * size, size) for j, size in sizes]
+
+    def force(self, scene, memory):
+        return self.at(scene, -self.b * self.own(scene.v))
+
+
+class PreslidingFriction(JointEffect):
+    """The LuGre bristle: s' = -sigma0 (w + |w| s / g(w)), friction s + sigma1 s' / sigma0 - b w.
+
+    In steady sliding that is the learned map: g is what the map holds beyond its viscous part.
+    [Canudas de Wit, Olsson, Astrom & Lischinsky 1995, eqs. 1 to 3, written in the bristle's torque s]
+    """
+
+    name: ClassVar[str] = "presliding_friction"
+    meaning: ClassVar[str] = "Friction with memory: before it slides, the joint gives like a spring."
+    confirm: ClassVar[str] = "Push the joint at rest with a small torque and see whether it springs back."
+    units: ClassVar[dict[str, str]] = {"sigma0": "N m/rad"}
+    words: ClassVar[dict[str, str]] = {"sigma0": "stiffness"}
+    memory: ClassVar[int] = 1
+    linear: ClassVar[bool] = False
+    log_sigma: Scalar
+    damping: Scalar
+    """sigma1 [N m s/rad]."""
+    viscous: Scalar
+    """b [N m s/rad]."""
+    knee: Scalar = known()
+    """Speed [rad/s] below which the map is read at this speed: it is smooth near rest, the bristle is not."""
+    size: Scalar = known()
+    fastest: Scalar = known()
+    """Largest relaxation rate that the integrator bears [1/s]."""
+
+    @classmethod
+    def candidates(cls, around):
+        if not around.learned:
+            return []
+        out = []
+        for j in around.joints:
+            size, speed, b = (float(values[j - 1]) for values in (around.torque, around.speed, around.viscous))
+            fixed = (0.02 * speed, size, 2.0 / around.dt)
+            for s in (0.5, 2.0, 8.0, 32.0):
+                inner = 0.4 * np.sqrt(s * size * around.inertia(j))  # a fifth of critical
+                stiff, soft = (cls.of(np.log(k * size), inner, b, *fixed, joint=j) for k in (1e4, s))
+                spread = cls.of(1.0, inner, 0.5 * b + 0.01 * size / speed, *fixed, joint=j)
+                out.append(Candidate(stiff, (soft,), spread))
+        return out
+
+    def values(self):
+        return {"sigma0": jnp.exp(self.log_sigma)}
+
+    def memory_scale(self):
+        return 0.1 * self.size[None]
+
+    def _level(self, scene):
+        v = self.own(scene.v)
+        fast = jnp.sign(v) * jnp.sqrt(v**2 + self.knee**2)
+        away = scene.v.at[self.joint - 1].set(jnp.where(v == 0, self.knee, fast))
+        total = jnp.abs(0.5 * self.own(scene.map(away) - scene.map(-away)))
+        return jnp.maximum(total - self.viscous * jnp.abs(fast), 0.1 * total) + 1e-9
+
+    def force(self, scene, memory):
+        torque = memory[0] + self.damping * jnp.exp(-self.log_sigma) * self.drift(scene, memory)[0]
+        return self.at(scene, torque - self.viscous * self.own(scene.v) - self.own(scene.friction))
+
+    def drift(self, scene, memory):
+        v, level = self.own(scene.v), self._level(scene)
+        relax = jnp.minimum(jnp.exp(self.log_sigma) * jnp.abs(v) / level, self.fastest)
+        return jnp.stack([-jnp.sign(v) * relax * level - relax * memory[0]])

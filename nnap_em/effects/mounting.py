@@ -49,7 +49,6 @@ class BaseVibration(AbstractEffect):
     meaning: ClassVar[str] = "The base shakes, or something else forces the machine periodically."
     confirm: ClassVar[str] = "Put an accelerometer on the base."
     units: ClassVar[dict[str, str]] = {"amplitude": "m/s^2", "frequency": "Hz", "phase": "rad"}
-    words: ClassVar[dict[str, str]] = {"amplitude": "amplitude", "frequency": "frequency", "phase": "phase"}
     sine: Scalar
     cosine: Scalar
     frequency: Scalar

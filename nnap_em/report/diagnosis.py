@@ -8,8 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..data.logs import Logs
-from ..diagnosis.change import changes
-from ..diagnosis.findings import Finding, advice, entry, suspected, undecided, verdict
+from ..diagnosis.findings import Finding, advice, changes, entry, suspected, undecided, verdict
 from ..diagnosis.interventions import Intervention
 from ..diagnosis.keys import Key, key_of, place_of, words
 from ..diagnosis.outcome import Diagnosis, Step

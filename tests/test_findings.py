@@ -173,9 +173,6 @@ def _written(tmp_path, diagnosis: Diagnosis, test: bool) -> tuple[dict, str]:
 @pytest.mark.slow  # fast: sentences of findings, here
 def test_the_page_tells_what_is_in_doubt(tmp_path):
     report, html = _written(tmp_path, _closed(ARM)._replace(steps=(LAST,)), False)
-    joints = report["visited"]
-    assert [row["load"] is None for row in joints] == [True, False]  # the second is driven
-    assert all(row["velocity"][0] < row["velocity"][1] for row in joints)
     assert report["effects"] == []
     rivals = [("dead_zone", 2), ("torsional_spring", 1)]
     assert [(rival["name"], rival["joint"]) for rival in report["undecided"]] == rivals

@@ -21,7 +21,7 @@ from ..storage.files import check_own
 from ..storage.log import Log
 from .document import versions
 from .html import Picture, Section, Table, picture, rendered, section, write_report
-from .style import AFTER, BEFORE, READING, ZERO_LINE, head, limits, panels, styled, symbol
+from .style import AFTER, BEFORE, ZERO_LINE, head, limits, styled, symbol
 
 INPUT_DIR, MOTION_DIR = "inputs", "motion"
 """Folders of the files to be played, and of what the machine should then do."""
@@ -112,15 +112,13 @@ def _stds(design: Design) -> dict[str, Float[np.ndarray, " phi"]]:
 
 
 def friction_entries(design: Design) -> list[dict[str, Any]]:
-    """Standard deviation of the friction of every joint over the velocities, now and after."""
+    """Standard deviation of the friction of every joint near rest, now and after."""
     nodes, out = np.asarray(design.fit.nodes), []
     stds = {side: std[: nodes.size].reshape(nodes.shape) for side, std in _stds(design).items()}
     for j, v in enumerate(nodes):
-        seen = design.criterion.weight[0, j] > 0
-        near = seen & (np.abs(v) <= design.slow[j])
+        near = (design.criterion.weight[0, j] > 0) & (np.abs(v) <= design.slow[j])
         rms = {side: float(np.sqrt(np.mean(std[j][near] ** 2))) for side, std in stds.items()}
-        curves = {"velocity": v[seen]} | {f"std_{side}": std[j][seen] for side, std in stds.items()}
-        out.append({"joint": j + 1, "near_rest_below": float(design.slow[j]), "near_rest": rms} | curves)
+        out.append({"joint": j + 1, "near_rest_below": float(design.slow[j]), "near_rest": rms})
     return out
 
 
@@ -168,8 +166,6 @@ def _verdict(document: dict[str, Any]) -> str:
 def _sections(document: dict[str, Any], design: Design) -> list[Section | None]:
     names, friction, units = names_of(design.fitted), document["friction"], document["units"]
     declared, rate = document["limits"]["declared"], document["limits"]["rate"]
-    caption = "Standard deviation of the learned friction: now, expected, and after as much time of the old inputs."
-    bands = [picture("found", "Friction bands", caption, bands_figure(friction, names))] if friction else []
     known = []
     for f in friction:
         slow = f"below {number(f['near_rest_below'], 2)} {names.unit(names.rates[f['joint'] - 1])}"
@@ -190,7 +186,6 @@ def _sections(document: dict[str, Any], design: Design) -> list[Section | None]:
             "were made with, and after the designed ones. Near rest: root mean square over the slowest fifth of the "
             "velocities that were visited.",
             Table(["", "value", "now", "old inputs", "designed", "smaller by"], known),
-            *bands,
         ),
         section(
             "What to play",
@@ -229,26 +224,6 @@ def _motions(design: Design, names: Names) -> list[Picture]:
         title = f"Sequences {which[0] + 1} to {which[-1] + 1}"
         out.append(picture("found", title, caption, motion_figure(design, names, which)))
     return out
-
-
-@styled
-def bands_figure(friction: Sequence[Mapping[str, Any]], names: Names) -> Figure:
-    """Standard deviation against velocity, a panel for each joint; `friction` as in design.json."""
-    figure, (grid,) = panels(len(friction))
-    sides = ("now", BEFORE, "now"), ("same_time_of_old_inputs", READING, "old inputs"), ("expected", AFTER, "designed")
-    for ax, entry, rate in zip(grid, friction, names.rates, strict=True):
-        slow = entry["near_rest_below"]
-        for side, colour, label in sides:
-            ax.plot(entry["velocity"], entry[f"std_{side}"], color=colour, label=label)
-        ax.set_xscale("symlog", linthresh=slow)
-        ax.set_xticks([v for v in ax.get_xticks() if v == 0 or abs(v) >= slow])
-        ax.set_yscale("log")
-        ax.axvspan(-slow, slow, color="#F1F1F1", lw=0, zorder=0, label="near rest")
-        ax.set_xlabel(f"velocity {symbol(rate)} [{names.unit(rate)}]")
-        ax.set_ylabel(f"std of friction [{names.force_unit(entry['joint'])}]")
-        ax.set_title(names.joint(entry["joint"]).replace("j", "J", 1) if len(friction) > 1 else "")
-    head(figure, "How well friction is known", list(grid))
-    return figure
 
 
 @styled

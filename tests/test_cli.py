@@ -152,10 +152,6 @@ def test_identify_writes_whole_results(bench, fit):
     reading = report["noise"]["measurement"]["x"]
     assert (reading["estimated"], reading["unit"]) == (True, "m")
     np.testing.assert_allclose(reading["std"], 1e-3, rtol=0.2)
-    pushes = np.concatenate([_read(bench / "train" / name)["u"] for name in _files(bench / "train")])
-    curve, visited = _read(fit / "friction.csv"), report["visited"][0]
-    np.testing.assert_allclose(visited["velocity"], curve["velocity"][[0, -1]], rtol=1e-9)
-    np.testing.assert_allclose(visited["load"], np.percentile(pushes, [0.5, 99.5]), rtol=1e-6)
     assert report["versions"]["jax"] == jax.__version__
     rise = report["log_likelihood"][-1] - report["log_likelihood"][-3]
     assert report["verdict"] == f"Fitted the friction of 1 joint to 4 sequences; {report['stopped']}."

@@ -150,7 +150,7 @@ def test_what_can_be_played_is_written_with_a_page(slide, plan, tmp_path):
     assert friction["near_rest"]["expected"] < friction["near_rest"]["now"] and mass["expected"] < mass["now"]
     assert mass["now"] == pytest.approx(parameter_table(slide[-1])["m"][1])
     html = (tmp_path / "design.html").read_text()
-    assert html.count("<img") == 2 and "None is declared" in html and document["verdict"] in html
+    assert html.count("<img") == 1 and "None is declared" in html and document["verdict"] in html
     (tmp_path / "inputs" / "4.csv").write_text("mine")
     with pytest.raises(StoreError, match=r"4\.csv"):
         check_places(tmp_path, 4)

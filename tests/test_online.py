@@ -14,7 +14,7 @@ from nnap_em.data.dataset import Dataset
 from nnap_em.data.rig import Declared, Rig
 from nnap_em.effects import catalogue
 from nnap_em.export.model import ExportError
-from nnap_em.export.online import table, write_observer
+from nnap_em.export.online import write_observer
 from nnap_em.fit.identify import begin
 from nnap_em.fit.observer import AMBIGUOUS, MISSING, OUTLIER, observer
 from nnap_em.fit.store import save
@@ -145,15 +145,6 @@ def test_wild_input_leaves_numbers_and_no_fault(which, single, request, tmp_path
     """
     write_observer(request.getfixturevalue(which)[0], tmp_path / "wild.c", single=single)
     assert all(wild(tmp_path / "wild.c", 30_000, *SANITIZED, "-O1")[k] > 0 for k in (0, 2))
-
-
-def test_a_table_is_as_exact_as_it_says():
-    curve = lambda v: jnp.tanh(3 * v) + 0.1 * v  # noqa: E731
-    found = table(curve, "f", 2.0, 0.01, 1e-11)
-    assert found is not None
-    v = np.concatenate([np.linspace(-11.9, 11.9, 5001), np.linspace(-0.03, 0.03, 1001)])  # to six times the rate
-    np.testing.assert_allclose(found(v), curve(jnp.asarray(v)), rtol=0, atol=3e-11)
-    assert table(lambda v: jnp.sign(v - 0.1), "f", 2.0, 0.01, 1e-11) is None
 
 
 def test_nothing_is_written_where_a_law_has_no_c_form(fit, tmp_path):

@@ -15,7 +15,7 @@ from ..fit.identify import Identified
 from ..model import hooks
 from ..storage.files import replace_own
 from .placement import of_command
-from .unroll import Line, Source, unrolled
+from .unroll import Line, Source, unroll
 
 WHOLE = """/* The whole number that a floating one is; 0 where none is. */
 static inline int whole(double x) { return (int)(x > -2000000000 && x < 2000000000 ? x : 0); }
@@ -61,8 +61,8 @@ def write_c(fitted: Identified, out: Path | str) -> list[str]:
     name, still = identifier(out.stem), jnp.zeros(len(system.coordinates))
     friction, feedforward, left = torques(fitted)
     sources = [
-        unrolled(f"{name}_friction", friction, v=still),
-        unrolled(f"{name}_feedforward", feedforward, q=still, v=still, a=still, time=jnp.zeros(1)),
+        unroll(f"{name}_friction", friction, v=still),
+        unroll(f"{name}_feedforward", feedforward, q=still, v=still, a=still, time=jnp.zeros(1)),
     ]
     absent = [f"{effect.name}{f' at joint {effect.joint}' if effect.joint else ''}" for effect in left]
     units = [f"{q} [{system.unit(q)}], torque [{system.force_unit(j)}]" for j, q in enumerate(system.coordinates, 1)]

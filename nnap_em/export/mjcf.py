@@ -1,7 +1,7 @@
 """An identified machine written back as MJCF: bodies, friction, and laws that MuJoCo has a plain element for."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -50,8 +50,6 @@ def write_mjcf(fitted: Identified, out: Path | str) -> list[str]:
     """
     out, model = Path(out), fitted.model
     system, forms = as_it_is(fitted), friction_forms(fitted)
-    if not fitted.rig.file:
-        raise ExportError("it is from before fits held their machine's file; identify again")
     file = _opened(fitted, system, forms)
     unplaced = placed(file, model.effects)
     left = servos_of(fitted)
@@ -90,9 +88,11 @@ def as_it_is(fitted: Identified) -> Tree:
 
 def servos_of(fitted: Identified) -> list[str]:
     """Servos with their numbers, a sentence each."""
-    numbers = lambda servo: ", ".join(f"{key} = {float(value):.4g}" for key, value in servo.values.items())  # noqa: E731
-    servos = [servo for servo in fitted.model.servos or () if servo.values]
-    return [f"the {servo.kind} servo of {servo.column}: {numbers(servo)}" for servo in servos]
+    return [
+        f"the {servo.kind} servo of {servo.column}: {_listed(servo.values)}"
+        for servo in fitted.model.servos or ()
+        if servo.values
+    ]
 
 
 def motors_of(fitted: Identified, system: Tree) -> list[Motor]:
@@ -111,8 +111,11 @@ def motors_of(fitted: Identified, system: Tree) -> list[Motor]:
 def named(effect: AbstractEffect) -> str:
     """A law with its place and its numbers."""
     at = f" at joint {effect.joint}" if effect.joint else f" of {effect.channel}" if effect.channel else ""
-    values = ", ".join(f"{name} = {float(value):.4g}" for name, value in effect.values().items())
-    return f"{effect.name}{at}{': ' + values if values else ''}"
+    return f"{effect.name}{at}{': ' * bool(effect.values())}{_listed(effect.values())}"
+
+
+def _listed(values: Mapping[str, Any]) -> str:
+    return ", ".join(f"{name} = {float(value):.4g}" for name, value in values.items())
 
 
 def _opened(fitted: Identified, system: Tree, forms: Sequence[FrictionForm]) -> OpenFile:
@@ -170,15 +173,10 @@ def _springs(file: OpenFile) -> None:
         slopes = [-(b + rest * (2 * c + 3 * d * rest)), -(c + 3 * d * rest), -d]
         element.stiffness, element.springref = slopes, rest if any((b, c, d)) else element.springref
         constant = a + rest * (b + rest * (c + rest * d))
-        if abs(constant) > 1e-12 * abs(a):
-            _constant(file, joint.name, constant)
-
-
-def _constant(file: OpenFile, joint: str, torque: float) -> None:
-    """A constant torque, which MuJoCo has as the cogging without poles of a motor without input; since MuJoCo 4.0."""
-    motor, quarter = _acting_on(file, joint, f"{joint}_offset", 1.0), 0.5 * math.pi
-    none = int(mujoco().mjtCtrlInput.mjINPUT_NONE)
-    motor.set_to_dcmotor(motorconst=[0.0, 0.0], resistance=1.0, ctrlspec=none, cogging=(torque, 0.0, quarter))
+        if abs(constant) > 1e-12 * abs(a):  # the cogging without poles of a motor without input; since MuJoCo 4.0
+            motor, none = _acting_on(file, joint.name, f"{joint.name}_offset", 1.0), mujoco().mjtCtrlInput.mjINPUT_NONE
+            cogging = constant, 0.0, 0.5 * math.pi
+            motor.set_to_dcmotor(motorconst=[0.0, 0.0], resistance=1.0, ctrlspec=int(none), cogging=cogging)
 
 
 def _rest(a: float, b: float, c: float, d: float) -> float:

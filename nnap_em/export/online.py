@@ -23,7 +23,7 @@ from ..smoother.mixture import WIDE_STD
 from ..storage.files import replace_own
 from .c99 import WHOLE, Dialect, function, identifier
 from .model import ExportError
-from .unroll import named, unrolled
+from .unroll import named, unroll
 
 DEGREE = 7
 """Degree of the polynomials of a friction table."""
@@ -41,13 +41,6 @@ class Table(NamedTuple):
     """Halvings of an octave."""
     rows: Float[np.ndarray, "segment entry"]
     """Coefficients, and the s that they are about."""
-
-    def __call__(self, v: np.ndarray) -> np.ndarray:
-        """Torque at velocities."""
-        half, s = len(self.rows) // 2, 1 + np.abs(v) / self.knee
-        segment = np.clip(np.searchsorted(self.rows[:half, -1], s, "right") - 1, 0, half - 1) + np.where(v < 0, half, 0)
-        powers = np.stack([(s - self.rows[segment, -1]) ** k for k in range(DEGREE + 1)], axis=-1)
-        return np.sum(self.rows[segment, :-1] * powers, axis=-1)
 
     def text(self, dialect: Dialect) -> str:
         """The table and its function in C; beyond its ends is the network."""
@@ -128,21 +121,19 @@ def _functions(model: StateSpaceModel, dialect: Dialect) -> tuple[list[str], int
             if found is not None:
                 tables[j] = found
                 one = lambda v, j=j: (network.torque(jnp.full(dof, v[0]))[j],)  # noqa: E731
-                texts += [function(unrolled(f"{found.name}_network", one, v=jnp.ones(1)), dialect), found.text(dialect)]
+                texts += [function(unroll(f"{found.name}_network", one, v=jnp.ones(1)), dialect), found.text(dialect)]
 
     def unknown(v):
         torque = network(v)
-        return jnp.stack(
-            [named(tables[j].name, lambda x, j=j: tables[j](x), v[j]) if j in tables else torque[j] for j in range(dof)]
-        )
+        return jnp.stack([named(tables[j].name, v[j]) if j in tables else torque[j] for j in range(dof)])
 
     def inputs(row) -> Inputs:
         u, before, time, age = row[:drives], row[drives : 2 * drives], row[2 * drives], row[2 * drives + 1]
         change = jnp.zeros((2, drives), u.dtype) if model.smooth else None
         return Inputs(u, before, time, age, row[2 * drives + 2 :] if scales else None, change)
 
-    def rate(x, row, friction=unknown):
-        return (dataclasses.replace(model, unknown=friction).rate(x, inputs(row), jnp.zeros(dof, x.dtype)),)
+    def rate(x, row):
+        return (dataclasses.replace(model, unknown=unknown).rate(x, inputs(row), jnp.zeros(dof, x.dtype)),)
 
     def reading(x, row):
         return model.emission(x, inputs(row)), jax.jacfwd(model.emission)(x, inputs(row))
@@ -158,11 +149,10 @@ def _functions(model: StateSpaceModel, dialect: Dialect) -> tuple[list[str], int
         return ravel_pytree(after)[0], fed
 
     x, row = jnp.asarray(model.start.mean), jnp.zeros(2 * drives + 2 + scales)
-    true = lambda x, row: rate(x, row, network)  # noqa: E731
     sources = [
-        unrolled("rate", rate, true, x=x, row=row),
-        unrolled("reading", reading, x=x, row=row),
-        unrolled("commands", commands, memory=flat, u=jnp.zeros(drives + scales), first=jnp.ones(1)),
+        unroll("rate", rate, x=x, row=row),
+        unroll("reading", reading, x=x, row=row),
+        unroll("commands", commands, memory=flat, u=jnp.zeros(drives + scales), first=jnp.ones(1)),
     ]
     texts.append(function(sources[0], dialect, points="2 * N"))
     return [*texts, *(function(source, dialect) for source in sources[1:])], flat.size

@@ -58,18 +58,11 @@ class Place(NamedTuple):
     write: Callable[[OpenFile, Any], None] = lambda file, law: None
 
 
-def placed(file: OpenFile, effects: Sequence[AbstractEffect]) -> tuple[tuple[AbstractEffect, str], ...]:
-    """Write laws to a file; those without a place, with the reason, in the order of the model.
-
-    A law of the command without a place acts before all that the file does with it, so that laws of the command
-    which come before it have none either; delays may change places with it.
-    """
+def placed(file: OpenFile, effects: Sequence[AbstractEffect]) -> list[tuple[AbstractEffect, str]]:
+    """Write laws to a file; those without a place, with the reason, in the order of the model."""
     unplaced = []
-    for place, effect in enumerate(effects):
-        follower = _follower(effects, place)
+    for effect in effects:
         try:
-            if follower is not None:
-                raise NoPlace(f"it acts before {follower.name}, which has no place")
             if of_command(effect) and effect.joint not in file.drives:
                 raise NoPlace("its command is that of a servo")
             if effect.name not in PLACES:
@@ -77,22 +70,13 @@ def placed(file: OpenFile, effects: Sequence[AbstractEffect]) -> tuple[tuple[Abs
             PLACES[effect.name].write(file, effect)
         except NoPlace as reason:
             unplaced.append((effect, str(reason)))
-    return tuple(unplaced)
+    return unplaced
 
 
 def of_command(effect: AbstractEffect) -> bool:
     """True for a law of what reaches a joint of the command."""
     kind = type(effect)
     return kind.input is not AbstractEffect.input or kind.drive is not AbstractEffect.drive
-
-
-def _follower(effects: Sequence[AbstractEffect], place: int) -> AbstractEffect | None:
-    """The law without a place before which a law of the command has to act."""
-    first = effects[place]
-    if not of_command(first) or first.name not in PLACES or first.name == "input_delay":
-        return None
-    after = (effect for effect in effects[place + 1 :] if of_command(effect) and effect.joint == first.joint)
-    return next((effect for effect in after if effect.name not in PLACES), None)
 
 
 def _spring(file: OpenFile, law: Any) -> None:

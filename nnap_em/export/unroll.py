@@ -50,12 +50,12 @@ _STEERED = {"gather": (0,), "dynamic_slice": (0,), "dynamic_update_slice": (0, 1
 """Operands that are moved, where others give the destination."""
 _MOVERS = (*_STEERED, "pad", "rev", "split", "transpose", "unstack")
 _NAMED = core.Primitive("named")
-_NAMED.def_abstract_eval(lambda x, function, value: x)
+_NAMED.def_abstract_eval(lambda x, function: x)
 
 
-def named(function: str, value: Callable[[np.ndarray], np.ndarray], x: jax.Array) -> jax.Array:
-    """A function of a scalar that is written by its name; `value` has its numbers."""
-    return _NAMED.bind(x, function=function, value=value)
+def named(function: str, x: jax.Array) -> jax.Array:
+    """A function of a scalar that is written by its name."""
+    return _NAMED.bind(x, function=function)
 
 
 class Line(NamedTuple):
@@ -78,33 +78,6 @@ class Source(NamedTuple):
     lines: tuple[Line, ...]
     results: tuple[Any, ...]
     """Names and numbers, flat."""
-
-    def __call__(self, *arguments: np.ndarray) -> np.ndarray:
-        """Results (batch, result) of arguments (batch, scalar)."""
-        known = {f"{name}{i}": a for name, b in zip(self.sizes, arguments, strict=True) for i, a in enumerate(b.T)}
-        number = lambda value: known[value] if isinstance(value, str) else value  # noqa: E731
-        with np.errstate(all="ignore"):
-            for line in self.lines:
-                known[line.name] = line.op.value(*map(number, line.values))
-        return np.stack([np.broadcast_to(number(x), len(arguments[0])) for x in self.results], axis=1)
-
-
-def unrolled(name: str, function: Callable, truth: Callable | None = None, **arguments: jax.Array) -> Source:
-    """`unroll`, compared with JAX at four random places about `arguments`.
-
-    The numbers of JAX are those of `truth`, where the function has others by their `named` ones.
-    Raises ExportError where there is no such source, or where its numbers are others.
-    """
-    source, rng = unroll(name, function, **arguments), np.random.default_rng(0)
-    centres = [np.asarray(a) for a in arguments.values()]
-    places = [np.where(a == 0, 3.0, 0.1 * a) * rng.normal(size=(4, *a.shape)) + a for a in centres]
-    results = jax.jit(jax.vmap(truth or function))(*(jnp.asarray(a, jnp.result_type(float)) for a in places))
-    expected = np.concatenate([np.asarray(a, np.float64).reshape(4, -1) for a in results], axis=1)
-    bound = math.sqrt(jnp.finfo(jnp.result_type(float)).eps)
-    computed = source(*(a.reshape(4, -1) for a in places)) if source.results else expected
-    if not np.allclose(computed, expected, rtol=bound, atol=bound, equal_nan=True):
-        raise ExportError(f"{name!r} in scalars gives other numbers than JAX")
-    return source
 
 
 def unroll(name: str, function: Callable[..., tuple[jax.Array, ...]], **arguments: jax.Array) -> Source:
@@ -139,7 +112,7 @@ class _Writer:
 
     def write(self, op: Op, whole: bool, *values: Any) -> Any:
         """The result of an operation: a name, or a number where all `values` are numbers."""
-        if not any(map(_is_name, values)):
+        if not op.own and not any(map(_is_name, values)):
             with np.errstate(all="ignore"):
                 return np.asarray(op.value(*values)).item()
         if (plain := _simpler(op, values)) is not None:
@@ -175,7 +148,7 @@ class _Writer:
             if inner in params:
                 return self.run(params[inner], operands)
         if name == "named":
-            return [self.each(Op(f"{params['function']}({{}})", params["value"], own=True), whole, *operands)]
+            return [self.each(Op(f"{params['function']}({{}})", np.positive, own=True), whole, *operands)]
         if not any(map(_symbolic, operands)):
             return _by_jax(equation, operands)
         _refuse(equation)

@@ -32,9 +32,7 @@ def write_urdf(fitted: Identified, out: Path | str) -> list[str]:
     """
     system, forms = as_it_is(fitted), friction_forms(fitted)
     if not fitted.rig.urdf:
-        raise ExportError(
-            f"{system.machine.file} is no URDF file, or the fit is older; write --mjcf, or identify again"
-        )
+        raise ExportError(f"{system.machine.file} is no URDF file; write --mjcf")
     root = ET.fromstring(fitted.rig.urdf, ET.XMLParser(target=ET.TreeBuilder(insert_comments=True)))
     # Laws that URDF holds, by name: in the numbers of bodies, in damping and in effort
     laws = ("payload", "motor_back_emf", "saturation")

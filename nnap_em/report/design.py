@@ -1,7 +1,6 @@
 """Everything that `nnap-em design` leaves behind: the inputs to be played, design.json and design.html."""
 
 import json
-import re
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -22,7 +21,7 @@ from ..storage.files import check_own
 from ..storage.log import Log
 from .document import versions
 from .html import Picture, Section, Table, picture, rendered, section, write_report
-from .style import AFTER, BEFORE, READING, ZERO_LINE, head, limits, panels, styled, symbol
+from .style import AFTER, BEFORE, ZERO_LINE, head, limits, styled, symbol
 
 INPUT_DIR, MOTION_DIR = "inputs", "motion"
 """Folders of the files to be played, and of what the machine should then do."""
@@ -52,8 +51,7 @@ def check_places(out: Path, count: int) -> list[Path]:
     check_own(out / f"design.{kind}" for kind in ("json", "html"))
     file = out / "design.json"
     document = json.loads(file.read_text()) if file.exists() else {}
-    names = [*document.get("inputs", []), *document.get("motion", [])]
-    mine = [out / name for name in names if re.fullmatch(rf"({INPUT_DIR}|{MOTION_DIR})/\d+\.csv", name)]
+    mine = [out / name for name in (*document.get("inputs", []), *document.get("motion", []))]
     check_own({out / folder / file for folder in (INPUT_DIR, MOTION_DIR) for file in _names(count)} - {*mine})
     return mine
 
@@ -64,15 +62,14 @@ def _names(count: int) -> list[str]:
 
 def _write_sequences(out: Path, design: Design) -> list[str]:
     """The files of all sequences; those of an older design go."""
-    fitted, states = design.fitted, design.fitted.model.system.coordinates + design.fitted.model.system.rates
-    files = _names(len(design.u))
+    states, inputs = design.fitted.model.system.coordinates + design.fitted.model.system.rates, design.u
+    files = _names(len(inputs))
     for old in check_places(out, len(files)):
         old.unlink(missing_ok=True)
+    bands = {"": design.middle, "_low": design.low, "_high": design.high}
     for i, file in enumerate(files):
-        write_csv(
-            out / INPUT_DIR / file, {"time": design.t} | dict(zip(fitted.rig.input_columns, design.u[i].T, strict=True))
-        )
-        bands = {"": design.middle, "_low": design.low, "_high": design.high}
+        columns = dict(zip(design.fitted.rig.input_columns, inputs[i].T, strict=True))
+        write_csv(out / INPUT_DIR / file, {"time": design.t} | columns)
         columns = {f"{name}{end}": band[i, :, s] for s, name in enumerate(states) for end, band in bands.items()}
         write_csv(out / MOTION_DIR / file, {"time": design.t} | columns)
     return files
@@ -83,27 +80,25 @@ def _write_sequences(out: Path, design: Design) -> list[str]:
 
 def describe(design: Design) -> dict[str, Any]:
     """Description of the experiment and of its expected information, as in design.json."""
-    fitted, system = design.fitted, design.fitted.model.system
-    states, inputs = system.coordinates + system.rates, fitted.rig.input_columns
+    rig, system, limits = design.fitted.rig, design.fitted.model.system, design.limits
+    states, inputs = system.coordinates + system.rates, rig.input_columns
     force = dict(zip(inputs, (system.force_unit(joint) for joint in system.joints), strict=True))
-    limits = design.limits
-    low, high = (*limits.low, *limits.lowest), (*limits.high, *limits.highest)
-    ends = zip((*inputs, *states), map(float, low), map(float, high), strict=True)
+    ends = zip((*limits.low, *limits.lowest), (*limits.high, *limits.highest), strict=True)
     document = {
         "format": 1,
-        "rig": fitted.rig.name,
-        "system": fitted.rig.system,
+        "rig": rig.name,
+        "system": rig.system,
         "units": {name: system.unit(name) for name in states} | force,
         "sequences": len(design.u),
         "seconds_each": float(design.t[-1]),
-        "dt": fitted.rig.dt,
-        "starts": [dict(zip(states, map(float, start), strict=True)) for start in design.start],
+        "dt": rig.dt,
+        "starts": [dict(zip(states, start.tolist(), strict=True)) for start in design.start],
         "limits": {
-            "values": {name: [a, b] for name, a, b in ends},
-            "rate": dict(zip(inputs, map(float, limits.rate), strict=True)),
-            "declared": sorted({*fitted.rig.limits.values, *fitted.rig.limits.rate, *fitted.rig.limits.start}),
+            "values": dict(zip((*inputs, *states), ([float(a), float(b)] for a, b in ends), strict=True)),
+            "rate": dict(zip(inputs, limits.rate.tolist(), strict=True)),
+            "declared": sorted({*rig.limits.values, *rig.limits.rate, *rig.limits.start}),
         },
-        "friction": friction_entries(design) if fitted.rig.friction else [],
+        "friction": friction_entries(design) if rig.friction else [],
         "parameters": parameter_entries(design),
     }
     return document | {"verdict": _verdict(document)}
@@ -117,15 +112,13 @@ def _stds(design: Design) -> dict[str, Float[np.ndarray, " phi"]]:
 
 
 def friction_entries(design: Design) -> list[dict[str, Any]]:
-    """Standard deviation of the friction of every joint over the velocities, now and after."""
+    """Standard deviation of the friction of every joint near rest, now and after."""
     nodes, out = np.asarray(design.fit.nodes), []
     stds = {side: std[: nodes.size].reshape(nodes.shape) for side, std in _stds(design).items()}
     for j, v in enumerate(nodes):
-        seen = design.criterion.weight[0, j] > 0
-        near = seen & (np.abs(v) <= design.slow[j])
+        near = (design.criterion.weight[0, j] > 0) & (np.abs(v) <= design.slow[j])
         rms = {side: float(np.sqrt(np.mean(std[j][near] ** 2))) for side, std in stds.items()}
-        curves = {"velocity": v[seen]} | {f"std_{side}": std[j][seen] for side, std in stds.items()}
-        out.append({"joint": j + 1, "near_rest_below": float(design.slow[j]), "near_rest": rms} | curves)
+        out.append({"joint": j + 1, "near_rest_below": float(design.slow[j]), "near_rest": rms})
     return out
 
 
@@ -155,11 +148,10 @@ def _verdict(document: dict[str, Any]) -> str:
     """Use of the experiment, in one sentence."""
     gains, near = [], [entry["near_rest"] for entry in document["friction"]]
     if near:
-        sides = ("expected", "same_time_of_old_inputs")
-        best, old = (listed([number(std["now"] / std[side], 2) for std in near]) for side in sides)
+        times = {side: listed([number(std["now"] / std[side], 2) for std in near]) for side in near[0]}
         joints = f"joints {listed([str(f['joint']) for f in document['friction']])}" if len(near) > 1 else "the joint"
-        times = f"{best} times narrower (as much time of the old inputs: {old})"
-        gains.append(f"the friction band near rest of {joints} {times}")
+        old = f"as much time of the old inputs: {times['same_time_of_old_inputs']}"
+        gains.append(f"the friction band near rest of {joints} {times['expected']} times narrower ({old})")
     surer = {name: p["now"] / p["expected"] for name, p in document["parameters"].items() if p["expected"] > 0}
     named = sorted((name for name, times in surer.items() if times > 1.1), key=lambda name: -surer[name])
     gains += [f"{name} {number(surer[name], 2)} times surer" for name in named[:3]]
@@ -172,21 +164,19 @@ def _verdict(document: dict[str, Any]) -> str:
 
 
 def _sections(document: dict[str, Any], design: Design) -> list[Section | None]:
-    names, friction = names_of(design.fitted), document["friction"]
-    bands, declared = [], document["limits"]["declared"]
-    if friction:
-        caption = "Standard deviation of the learned friction: now, expected, and after as much time of the old inputs."
-        bands = [picture("found", "Friction bands", caption, bands_figure(friction, names))]
-    slow = lambda f: f"below {number(f['near_rest_below'], 2)} {names.unit(names.rates[f['joint'] - 1])}"  # noqa: E731
-    known = [[f"friction of joint {f['joint']} near rest", slow(f), *_gain(f["near_rest"])] for f in friction]
+    names, friction, units = names_of(design.fitted), document["friction"], document["units"]
+    declared, rate = document["limits"]["declared"], document["limits"]["rate"]
+    known = []
+    for f in friction:
+        slow = f"below {number(f['near_rest_below'], 2)} {names.unit(names.rates[f['joint'] - 1])}"
+        known.append([f"friction of joint {f['joint']} near rest", slow, *_gain(f["near_rest"])])
     known += [[name, f"{number(p['value'])} {p['unit']}", *_gain(p)] for name, p in document["parameters"].items()]
-    states = [f"{name} [{document['units'][name]}]" for name in document["starts"][0]]
+    states = [f"{name} [{units[name]}]" for name in document["starts"][0]]
     starts = [
         [file, *map(number, start.values())] for file, start in zip(document["inputs"], document["starts"], strict=True)
     ]
-    rate = document["limits"]["rate"]
     limits = [
-        [f"{name} [{document['units'][name]}]", *map(number, pair), number(rate[name]) if name in rate else ""]
+        [f"{name} [{units[name]}]", *map(number, pair), number(rate[name]) if name in rate else ""]
         for name, pair in document["limits"]["values"].items()
     ]
     return [
@@ -196,7 +186,6 @@ def _sections(document: dict[str, Any], design: Design) -> list[Section | None]:
             "were made with, and after the designed ones. Near rest: root mean square over the slowest fifth of the "
             "velocities that were visited.",
             Table(["", "value", "now", "old inputs", "designed", "smaller by"], known),
-            *bands,
         ),
         section(
             "What to play",
@@ -235,30 +224,6 @@ def _motions(design: Design, names: Names) -> list[Picture]:
         title = f"Sequences {which[0] + 1} to {which[-1] + 1}"
         out.append(picture("found", title, caption, motion_figure(design, names, which)))
     return out
-
-
-@styled
-def bands_figure(friction: Sequence[Mapping[str, Any]], names: Names) -> Figure:
-    """Standard deviation against velocity, a panel for each joint; `friction` as in design.json."""
-    figure, (grid,) = panels(len(friction))
-    sides = (
-        ("now", BEFORE, "now"),
-        ("same_time_of_old_inputs", READING, "old inputs"),
-        ("expected", AFTER, "designed"),
-    )
-    for ax, entry, rate in zip(grid, friction, names.rates, strict=True):
-        slow = entry["near_rest_below"]
-        for side, colour, label in sides:
-            ax.plot(entry["velocity"], entry[f"std_{side}"], color=colour, label=label)
-        ax.set_xscale("symlog", linthresh=slow)
-        ax.set_xticks([v for v in ax.get_xticks() if v == 0 or abs(v) >= slow])
-        ax.set_yscale("log")
-        ax.axvspan(-slow, slow, color="#F1F1F1", lw=0, zorder=0, label="near rest")
-        ax.set_xlabel(f"velocity {symbol(rate)} [{names.unit(rate)}]")
-        ax.set_ylabel(f"std of friction [{names.force_unit(entry['joint'])}]")
-        ax.set_title(names.joint(entry["joint"]).replace("j", "J", 1) if len(friction) > 1 else "")
-    head(figure, "How well friction is known", list(grid))
-    return figure
 
 
 @styled

@@ -20,7 +20,7 @@ from ..fit.misfit import moved
 from ..fit.predict import Prediction
 from ..numerics.profile import stage
 from ..storage.log import Log
-from .document import errors, noise, parameters, predictions, shared, visited
+from .document import errors, noise, parameters, predictions, shared
 from .fit_plots import effect_figure, error_figure, friction_figure, prediction_figure
 from .html import Picture, picture, write_report
 from .page import page
@@ -85,7 +85,6 @@ def write_diagnosis(
         "interventions": [_disturbance(force, train.files) for force in diagnosis.interventions],
         "error": error,
         "models": {name: f"{name}.npz" for name in both},
-        "visited": visited(diagnosis.before, velocities, train) if diagnosis.before.rig.friction else None,
         "tests": {name: [t._asdict() for t in each] for name, each in tested.items()},
         "parameters": {name: parameters(fitted) for name, fitted in both.items()},
         "noise": {name: noise(fitted) for name, fitted in both.items()},

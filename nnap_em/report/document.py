@@ -13,14 +13,12 @@ from jaxtyping import Float
 from .. import __version__
 from ..data.dataset import stepped
 from ..data.logs import Logs
-from ..data.servo import TORQUE
 from ..diagnosis.hypothesis import covariances
 from ..effects.equations import UnknownTerm
 from ..fit.identifiability import identifiability, sentences
 from ..fit.identify import FrictionTable, Identified, parameter_table
 from ..fit.predict import Prediction, given_of, horizon_errors, horizons_of, predict
 from ..model.law import LAW_UNITS, PARAMETERS, describe, fit_law, passed
-from .tables import INNER
 
 
 def shared(fitted: Identified, train: Logs, test: Logs | None, *, seed: int, began: float) -> dict[str, Any]:
@@ -52,18 +50,6 @@ def masked(train: Logs, test: Logs | None) -> list[dict[str, Any]]:
     """Readings of the logs that no fit and no filter used."""
     parts = (("train", train), ("test", test))
     return [{"part": part, **entry._asdict()} for part, logs in parts if logs for entry in logs.masked]
-
-
-def visited(fitted: Identified, velocity: Float[np.ndarray, "sample dof"], train: Logs) -> list[dict[str, Any]]:
-    """Range of velocity of every joint, and of the torque of its drive if that is logged, that holds 99 of 100 rows."""
-    system, u = fitted.model.system, np.asarray(train.data.u)[np.asarray(train.data.valid)]
-    drives = zip(system.joints, system.gears, fitted.rig.kinds.values(), strict=True)
-    load = {joint: gear * u[:, i] for i, (joint, gear, kind) in enumerate(drives) if kind == TORQUE}
-    ends = lambda values: np.percentile(values, INNER).tolist()  # noqa: E731
-    return [
-        {"joint": j, "velocity": ends(velocity[:, j - 1]), "load": ends(load[j]) if j in load else None}
-        for j in range(1, len(system.rates) + 1)
-    ]
 
 
 def parameters(fitted: Identified) -> dict[str, Any]:

@@ -23,7 +23,7 @@ from ..numerics.digits import counted
 from ..numerics.profile import stage
 from ..storage.files import replace_bytes
 from ..storage.log import Log
-from .document import errors, friction_law, noise, parameters, predictions, shared, unknown_terms, visited
+from .document import errors, friction_law, noise, parameters, predictions, shared, unknown_terms
 from .fit_plots import error_figure, friction_figure, term_figure
 from .html import Picture, picture, write_report
 from .page import page
@@ -49,10 +49,9 @@ def write_identification(
     True where the fit describes the motion.
     """
     figures: list[Picture] = []
-    names, laws, ranges = names_of(fitted), None, None
+    names, laws = names_of(fitted), None
     if fitted.rig.friction:
         velocities = _velocities(fitted, train, epochs)
-        ranges = visited(fitted, velocities, train)
         table = friction_table(fitted, jnp.asarray(visited_nodes(velocities)))
         laws = friction_law(fitted, table, velocities)
         write_friction(out / "friction.csv", *map(np.asarray, (table.velocity, table.torque, table.std)))
@@ -88,7 +87,6 @@ def write_identification(
         "reached": float(np.nanmean(fitted.state.top)),
         "epochs": entries,
         "left_out": entries[-1]["left_out"],
-        "visited": ranges,
         "smoother": smoother,
         "model": "model.npz",
     }

@@ -314,15 +314,6 @@ def test_an_input_that_is_silent_alone_is_seen(tmp_path):
     assert (gap.start, gap.end) == pytest.approx((3.99, 7.0), abs=0.02)
 
 
-def test_a_declared_gap_that_would_fill_memory_with_empty_rows_is_refused(tmp_path):
-    path = _csv(tmp_path / "a.csv", T + 1000 * (T >= 5), _columns(T))
-    assert _rows(_import(path, "gap = 100")) == [500, 500]
-    with pytest.raises(DataError, match=r"\[import\] gap: 1.01e\+05 rows of 1000 readings would be empty"):
-        _import(path, "gap = 1001")
-    path = _csv(tmp_path / "b.csv", T + 400 * (T >= 5), _columns(T))
-    assert _rows(_import(path, "gap = 401\nlongest = 500")) == [41000]
-
-
 def test_stretches_that_lie_in_several_parts_are_those_of_a_count_at_each_time():
     at = np.linspace(-0.05, 1.05, 2203)
     rng = np.random.default_rng(0)

@@ -1,6 +1,5 @@
 """Addresses of the columns of a rig in a log: as declared, or by their names, in the unit that these end in."""
 
-import difflib
 import math
 import re
 from collections.abc import Mapping, Sequence
@@ -8,7 +7,7 @@ from pathlib import Path
 
 from ..data.dataset import DataError
 from ..data.formats import refuse
-from ..data.rig import Rig
+from ..data.rig import Rig, nearest
 from ..data.units import UNITS, factor, named_unit
 from ..numerics.digits import counted
 from .recording import OTHER, Address, Topic, places
@@ -18,13 +17,10 @@ def resolve(
     path: Path, topics: Sequence[Topic], inputs: Sequence[str], measured: Sequence[str], declared: Mapping[str, Address]
 ) -> dict[str, Address]:
     """Address of each column of the rig; DataError with the nearest names where one is absent."""
-    out = {}
-    for name in (*inputs, *measured):
-        if name in declared:
-            out[name] = declared_at(path, topics, declared[name], name)
-        else:
-            out[name] = _by_name(path, topics, name, name in inputs)
-    return out
+    return {
+        name: declared_at(path, topics, declared[name], name) if name in declared else _by_name(path, topics, name)
+        for name in (*inputs, *measured)
+    }
 
 
 def declared_at(path: Path, topics: Sequence[Topic], address: Address, column: str) -> Address:
@@ -37,7 +33,7 @@ def declared_at(path: Path, topics: Sequence[Topic], address: Address, column: s
             return address._replace(topic=topic.name, path=there if there in topic.fields else alike[0])
     topic = next((topic for topic in topics if topic.name == address.topic), None)
     if topic is None:
-        hint = near(address.topic, [topic.name for topic in topics])
+        hint = nearest(address.topic, [topic.name for topic in topics])
         raise DataError(f"{path}: {where}: there is no topic {address.topic!r}; {hint}")
     if not topic.fields:
         refuse(path, where, f"topic {topic.name!r} ({topic.kind}) holds no numbers that can be read", OTHER)
@@ -49,7 +45,7 @@ def declared_at(path: Path, topics: Sequence[Topic], address: Address, column: s
         problem = f"{match[1]!r} of {topic.name!r} has {counted(len(row), 'value')}"
         refuse(path, where, problem, f"count from 0 to {len(row) - 1}")
     owner = f"topic {topic.name!r}" if topic.name else "the table"
-    refuse(path, where, f"{owner} has no field {at!r}", near(at, topic.fields))
+    refuse(path, where, f"{owner} has no field {at!r}", nearest(at, topic.fields))
 
 
 def in_unit(path: Path, column: str, at: Address, rig: Rig) -> tuple[Address, str]:
@@ -74,36 +70,17 @@ def in_unit(path: Path, column: str, at: Address, rig: Rig) -> tuple[Address, st
     return at._replace(scale=at.scale or 1.0), note
 
 
-def _by_name(path: Path, topics: Sequence[Topic], column: str, is_input: bool) -> Address:
-    """The one place whose name is that of the column: a field, or a joint of an array of joints."""
-    names = set(_names(column, is_input))
+def _by_name(path: Path, topics: Sequence[Topic], column: str) -> Address:
+    """The one field that is called as the column, or whose path ends so."""
     every = [Address(topic.name, field) for topic in topics for field in topic.fields]
-    addresses = [at for at in every if at.path in names] or [
-        at._replace(scale=None) for at, word in places(topics) if word in names
-    ]
+    addresses = [at for at in every if at.path == column]
+    addresses = addresses or [at._replace(scale=None) for at, word in places(topics) if word == column]
     hint = f'write [import.columns] {column} = "topic:field" in rig.toml'
     if not addresses:
-        shown = [str(at) for at in every]
-        words = [re.split(r"[:.\[]", name.rstrip("]"))[-1] for name in shown]
-        raise DataError(f"{path}: column {column!r}: nothing is called so; {hint}; {near(column, shown, words)}")
+        raise DataError(
+            f"{path}: column {column!r}: nothing is called so; {hint}; {nearest(column, list(map(str, every)))}"
+        )
     if len(addresses) > 1:
         several = " and ".join(repr(str(each)) for each in addresses[:4])
         raise DataError(f"{path}: column {column!r}: may be {several}; {hint}")
     return addresses[0]
-
-
-def _names(column: str, is_input: bool) -> list[str]:
-    if is_input:
-        return [column, f"effort[{column}]"]
-    # Prefix of the name of a joint for its angle and its rate, and the array that holds them
-    parts = (("", "position"), ("d", "velocity"))
-    return [column, *(f"{array}[{column.removeprefix(d)}]" for d, array in parts if column.startswith(d))]
-
-
-def near(word: str, names: Sequence[str], words: Sequence[str] = ()) -> str:
-    """The hint for a misspelt name among many, which are called by `words`."""
-    called = {call.casefold(): name for call, name in zip(words or names, names, strict=True)}
-    close = difflib.get_close_matches(word.casefold(), called, 1)
-    question = f"did you mean {called[close[0]]!r}? " if close else ""
-    more = f", and {len(names) - 12} more" if len(names) > 12 else ""
-    return f"{question}possible here: {', '.join(names[:12]) or 'none'}{more}"

@@ -21,11 +21,10 @@ from recorders import imported, ns, plain_json, write_hdf5, write_mcap
 from nnap_em.data import formats
 from nnap_em.data.dataset import DataError
 from nnap_em.data.logs import DataWarning, read_logs
-from nnap_em.data.rig import RigError, read_rig
+from nnap_em.data.rig import read_rig
 from nnap_em.import_ import table_file, text_file
-from nnap_em.import_.columns import in_unit, resolve
-from nnap_em.import_.files import reader
-from nnap_em.import_.recording import Address, Topic, address, last_word, places
+from nnap_em.import_.columns import in_unit
+from nnap_em.import_.recording import Address, Topic, last_word, places
 from nnap_em.systems import specs
 
 RIG = pendulum_rig(dt=DT)
@@ -202,25 +201,13 @@ def test_a_unit_of_the_file_alone_counts(tmp_path):
         _close([table], len(table), 1e-7)
 
 
-def test_a_column_of_a_data_set_is_in_the_unit_of_its_name(tmp_path):
-    path = tmp_path / "rig.toml"
-    path.write_text(RIG.replace('["u"]', '["M [mNm]"]'))
-    with pytest.raises(RigError, match=r"column 'M \[mNm\]': in mNm by its name, but read in N m; call it otherwise"):
-        read_rig(path, specs)
-    path.write_text(RIG.replace('["u"]', '["M [Nm]"]'))
-    assert read_rig(path, specs).input_columns == ("M [Nm]",)
-
-
 MOMENTS = {  # the header, and the texts of a time [s] on 3 November 2026, from before midnight on
     "date and time": ("Date,Time", lambda day, s: f"{day:%d.%m.%Y},{day:%H:%M}:{s:06.3f}"),
     "month first": ("Date,Time", lambda day, s: f"{day:%m/%d/%Y},{day:%H:%M}:{s:06.3f}"),
     "day first": ("Datum,Uhrzeit", lambda day, s: f"{day:%d/%m/%Y},{day:%H:%M}:{s:06.3f}"),
-    "ISO 8601": ("Timestamp", lambda day, s: f"{day:%Y-%m-%dT%H:%M}:{s:06.3f}"),
     "with a zone": ("t", lambda day, s: f"{day:%Y-%m-%d %H:%M}:{s:06.3f}+01:00"),
     "AM and PM": ("Date/Time", lambda day, s: f"{day:%d-%b-%Y %I:%M}:{s:06.3f} {day:%p}"),
     "time of day": ("Time [hh:mm:ss]", lambda day, s: f"{day:%H:%M}:{s:06.3f}"),
-    "seconds of the day": ("time", lambda day, s: f"{day.hour * 3600 + day.minute * 60 + s:.3f}"),
-    "one column called date": ("Date", lambda day, s: f"{day:%Y/%m/%d %H:%M}:{s:06.3f}"),
 }
 
 
@@ -260,14 +247,10 @@ REFUSED = {  # what writes a file, its name, and words of the message
     "bag": (None, "run.bag", "the file is damaged", "use another copy"),
     "db3": (None, "run.db3", "the file is damaged", "use another copy"),
     "xlsx": (None, "a.xlsx", "no workbook, or damaged", "save the sheet as CSV"),
-    "CODESYS binary": (None, "a.trace", "*.trace.csv"),
     "TwinCAT recording": (None, "a.svdx", "TC3ScopeExportTool.exe svd="),
     "commas twice": (_table(_names(","), COLUMNS, ",", ","), "a.csv", "fields under 4 names", "decimals with '.'"),
     "a text": (_last("9;x;1;1"), "a.csv", "line 202, column 'u': found 'x'; write a number"),
-    "a date": (_last("2026-01-01;1;1;1"), "a.csv", "line 202, column 'time': found '2026-01-01'"),
     "a field too many": (_last("9;1;1;1;1"), "a.csv", "line 202: found 5 fields under 4 names"),
-    "thousands": (_last("9;1.000,5;1;1", ","), "a.csv", "line 202, column 'u': found '1.000,5'"),
-    "no time": (_last(";1;1;1"), "a.csv", "line 202, column 'time': found ''", "never empty"),
     "a misspelt time": (_table(_names(",", "tme")), "a.csv", "no column of times", "if 'tme' is that"),
     "no header": (_table("0;1;2;3", COLUMNS, ";"), "a.txt", "no column of numbers under a name"),
 }
@@ -299,14 +282,6 @@ def test_the_last_word_of_a_path():
         assert at.scale == (None if "[" in path else pytest.approx(DEG))
 
 
-def test_a_name_with_a_colon_is_no_topic(tmp_path):
-    """Nor is a topic missed whose name has one."""
-    topics = [Topic("", "", None, ("Axis:pos", "u")), Topic("/a:b", "", None, ("q",))]
-    declared = {name: Address(*address(at)) for name, at in (("one", "Axis:pos"), ("two", "/a:b:q"))}
-    found = resolve(tmp_path, topics, ("u",), ("one", "two"), declared)
-    assert [(at.topic, at.path) for at in found.values()] == [("", "u"), ("", "Axis:pos"), ("/a:b", "q")]
-
-
 @pytest.mark.parametrize("suffix", ["csv", "parquet"])
 def test_a_log_without_times_is_read_where_dt_is_declared(tmp_path, suffix):
     """One whose times have another name is refused."""
@@ -324,19 +299,6 @@ def test_a_log_without_times_is_read_where_dt_is_declared(tmp_path, suffix):
         read_logs(path.parent, rig)
 
 
-def test_structs_with_different_clocks_are_refused_and_columns_of_a_matrix_have_numbers(tmp_path):
-    """Simulink's structures with time, and its format Array."""
-    path = tmp_path / "a.mat"
-    struct = lambda t, y: {"time": t, "signals": {"values": y, "label": ""}}  # noqa: E731
-    scipy.io.savemat(path, {"u": struct(T, U), "theta1": struct(T[1:], Q[1:])})
-    with pytest.raises(DataError, match="column 'time': stands there twice with different numbers; save signals of"):
-        reader(path).topics(path)
-    for name in ("out", "yout"):
-        scipy.io.savemat(path, {"tout": T[:, None], name: np.stack([Q, V], 1)})
-        (topic,) = reader(path).topics(path)
-        assert topic.fields == (f"{name}[0]", f"{name}[1]") and "'tout'" in topic.kind
-
-
 def test_a_plain_csv_file_is_none_of_another_dialect(tmp_path):
     for header in ("time,u,theta1", "time,/a/b,c:d", "a,time,b"):
         assert text_file.plain_csv(dialects.table(tmp_path / "a.csv", header, (T, U, Q)))
@@ -344,14 +306,6 @@ def test_a_plain_csv_file_is_none_of_another_dialect(tmp_path):
         assert not text_file.plain_csv(dialects.table(tmp_path / "a.csv", header, (T, U, Q)))
     found = text_file.layout(["Date;Time;u;q", *9 * ["03.11.2026;12:00:00,5;0,5;1,5"]])
     assert found and (found.marks, found.first, found.clocks) == ((";", ","), 1, (1,))
-
-
-@pytest.mark.parametrize("rows", [0, 1])
-def test_a_table_of_lists_without_rows_is_refused(tmp_path, rows):
-    lists = pa.array([[1.0, 2.0]] * rows, pa.list_(pa.float64()))
-    pq.write_table(pa.table({"time": pa.array([0.0] * rows, pa.float64()), "state": lists}), tmp_path / "a.parquet")
-    with pytest.raises(DataError, match=rf"a\.parquet: the file: found {rows} rows?; write 2 rows or more"):
-        reader(tmp_path / "a.parquet").topics(tmp_path / "a.parquet")
 
 
 _lines = st.lists(st.lists(st.text('0159.,;-eE\t"#NameTrueX_Value[]°', max_size=7), max_size=4), max_size=9)

@@ -26,7 +26,6 @@ from faults import numbers
 from helpers import begun
 from shell import ENVIRONMENT
 
-from nnap_em.commands import check as check_command
 from nnap_em.commands import cli
 from nnap_em.commands import identify as identify_command
 from nnap_em.commands.identify import MISFIT_STATUS
@@ -241,12 +240,6 @@ def test_a_search_that_is_killed_stopped_and_out_of_time_goes_on_to_the_same_num
     assert [effect["name"] for effect in left["report"]["effects"]] == ["torsional_spring"]
 
 
-def test_a_folder_that_cannot_be_is_refused_before_the_work(rig, tmp_path, capsys):
-    (tmp_path / "file").write_text("")
-    assert cli.main(_order("identify", rig, tmp_path / "file" / "out")) == 2
-    assert _last_line(capsys.readouterr().err) == f"nnap-em: error: {tmp_path}/file/out: Not a directory"
-
-
 def _stop(*_, **__):
     raise KeyboardInterrupt
 
@@ -260,27 +253,6 @@ def test_ctrl_c_before_the_first_step_leaves_nothing(rig, tmp_path, monkeypatch,
     assert cli.main(order) == 130
     assert _last_line(capsys.readouterr().err) == "nnap-em: stopped; the files that were written are whole"
     assert not list(tmp_path.iterdir())
-
-
-def test_ctrl_c_that_a_garbage_collection_swallows_stops_at_the_next_line(tmp_path, monkeypatch, capsys):
-    class Litter:
-        def __del__(self):
-            os.kill(os.getpid(), signal.SIGINT)
-
-    def lost(args, log):
-        litter = Litter()
-        del litter
-        log("one line")
-        raise AssertionError
-
-    monkeypatch.setattr(sys, "unraisablehook", lambda _: None)
-    monkeypatch.setattr(check_command, "run", lost)
-    assert cli.main(["check", str(tmp_path)]) == 130
-    assert _last_line(capsys.readouterr().err) == "nnap-em: stopped; the files that were written are whole"
-    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
-
-
-# --- the journal itself
 
 
 def _flipped(content: bytes) -> bytes:

@@ -2,7 +2,6 @@
 
 import warnings
 
-import jax
 import numpy as np
 import plant
 import pytest
@@ -10,13 +9,12 @@ from helpers import swing, swing_rig
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from nnap_em import horizon_errors, identify, predict, read_logs, read_rig
+from nnap_em import read_logs, read_rig
 from nnap_em.data.dataset import DataError
 from nnap_em.data.formats import write_csv
-from nnap_em.data.logs import DataWarning, Logs
+from nnap_em.data.logs import Logs
 from nnap_em.data.plausible import Columns
 from nnap_em.data.rough import rough
-from nnap_em.fit.check import check
 
 DT, ROWS = 0.01, 501
 NOISE = {"theta1": 0.005, "dtheta1": 0.05}
@@ -155,50 +153,6 @@ def test_a_machine_at_rest_is_not_stuck():
     assert _faults({"theta1": np.full(ROWS, 0.25), "dtheta1": rate}) == {}  # constant: another warning
 
 
-def _arm(seed: int, step: float, noise: float, rate: str, hold: int = 1) -> Columns:
-    """Seven axes, of which one moves from pose to pose; the others rest, creep a little, or slip by some steps."""
-    rng, t = np.random.default_rng(seed), DT * np.arange(ROWS)
-    q = np.tile(rng.uniform(-2, 2, (7, 1)), ROWS)
-    for start, length in ((0.5, 1.0), (2.2, 0.7), (3.5, 0.8)):
-        q[seed % 7] += rng.uniform(-1, 1) * _ease((t - start) / length)
-    q[(seed + 1) % 7] += 2e-5 * (1 - np.exp(-t))
-    q[(seed + 2) % 7] += 5e-5 * (t > rng.uniform(1, 4))
-    speed = np.gradient(q, DT, axis=1)
-    read = q + noise * rng.standard_normal(q.shape)
-    read = step * np.round(read / step) if step else read
-    counted = np.diff(read, axis=1, prepend=read[:, :1]) / DT
-    filtered = np.zeros_like(counted)
-    for k in range(1, ROWS):
-        filtered[:, k] = 0.8 * filtered[:, k - 1] + 0.2 * counted[:, k]
-    gyro = 2e-3 * np.round((speed + 1e-3 + 3e-3 * rng.standard_normal(q.shape)) / 2e-3)
-    rates = {"counted": counted, "filtered": filtered, "gyro": gyro, "dead": np.where(abs(speed) < 5e-3, 0.0, speed)}
-    columns = {f"q{i}": y for i, y in enumerate(read)} | {f"dq{i}": y for i, y in enumerate(rates.get(rate, []))}
-    return {name: y[np.arange(ROWS) // hold * hold] for name, y in columns.items()}
-
-
-STEPS = [(0, 1e-5, 1), (1e-6, 0, 5), (1e-6, 5e-7, 1), (4e-5, 0, 1), (4e-5, 1e-5, 5), (1.5e-3, 3e-4, 5)]
-"""Steps and noise of an encoder, and rows for which its readings are held."""
-
-
-@pytest.mark.parametrize("rate", ["none", "filtered", "dead"])
-def test_axes_that_rest_on_purpose_are_left_alone(rate):
-    """Six of seven axes rest, at all steps and noises of an encoder; a rate has an offset, a delay or a threshold."""
-    for seed, (step, spread, hold) in enumerate(STEPS):
-        alarms = [entry for entry in rough(_arm(seed, step, spread, rate, hold), DT) if entry.kind != "spike"]
-        assert alarms == []
-
-
-@pytest.mark.parametrize("rate", ["counted", "gyro"])
-def test_an_axis_of_an_arm_that_sticks_while_it_moves_is_found(rate):
-    """The other side: the same arm, whose moving axis repeats a reading for half a second of its way."""
-    readings = dict(_arm(0, 4e-5, 1e-5, rate))
-    readings["q0"] = readings["q0"].copy()
-    readings["q0"][81:131] = readings["q0"][80]
-    ((kind, column, rows),) = [entry for entry in rough(readings, DT) if entry.kind != "spike"]
-    assert (kind, column) == ("stuck", "q0")
-    assert set(range(81, 131)) <= set(rows.tolist())
-
-
 def test_one_count_of_an_encoder_is_no_spike_of_its_rate():
     """A rate that is filtered from steps; one of twice the size is masked."""
     counts = np.where(np.arange(ROWS) > 250, 1e-3, 0.0)
@@ -297,34 +251,3 @@ def test_lost_rows_come_back_without_readings_and_a_log_ends_at_a_longer_gap(tmp
         _write(tmp_path, swing(), kept)
         with pytest.raises(DataError, match=r"a gap|rows are"):
             read_logs(tmp_path, swing_rig(clock="session"))
-
-
-# --- through a fit
-
-SLIDE = plant.Case(system="slide", hidden=False, sequences=6, tests=2, steps=200, noise=(5e-4, 5e-3), seed=4)
-
-
-@pytest.mark.slow  # fast: test_spikes_are_found_row_by_row
-def test_a_fit_survives_spikes_and_check_names_them(tmp_path):
-    plant.write(SLIDE, tmp_path)
-    rig = read_rig(tmp_path / "rig.toml")
-    train, test = (read_logs(tmp_path / part, rig) for part in ("train", "test"))
-    rng = np.random.default_rng(0)
-    for path in sorted((tmp_path / "train").glob("*.csv")):
-        table = np.genfromtxt(path, delimiter=",", names=True)
-        columns = {name: table[name] for name in table.dtype.names}
-        for name, std in zip(("x", "dx"), SLIDE.noise, strict=True):
-            columns[name] = columns[name] + 50 * std * (rng.random(len(table)) < 0.01)
-        write_csv(path, columns)
-    with pytest.warns(DataWarning, match="spike"):
-        spoilt = read_logs(tmp_path / "train", rig)
-
-    def error(logs: Logs) -> float:
-        fitted = identify(rig, logs.data, key=jax.random.key(0), epochs=6)
-        prediction = predict(fitted, test.data, 1.0, key=jax.random.key(0))
-        return horizon_errors(prediction, fitted, test.data, 1.0)["x"][3]
-
-    assert error(spoilt) < 1.3 * error(train)
-    rows = [f for f in check(rig, spoilt, None, key=jax.random.key(0)) if f.subject == "rough"]
-    assert [f.mark for f in rows] == ["warning", "warning"]
-    assert "x: spike: " in rows[0].text

@@ -247,7 +247,7 @@ BAD = {  # the file, what writes it, and words of the message
     "unknown encoding": ("a.mcap", _unread, "'/js' | in 'flatbuffer' | are not read | JSON or protobuf"),
     "no JSON": ("a.mcap", lambda p: write_mcap(p, {"/js": ((*plain_json()[:4], lambda m: m), ns(T),
         [b'{"q": 1'] * 300)}),
-        "'/js' | does not fit its schema (Expecting | record again"),
+        "'/js' | does not fit its schema (Expecting | write it as"),
     "HDF5 without times": ("a.h5", lambda p: write_hdf5(p, {"js": {"time": np.where(T[5] == T, np.nan, T), "q": T}}),
         "'/js/time' | no numbers | cut the rows"),
     "no HDF5 file": ("a.h5", lambda p: p.write_text("hello"), "no HDF5 file | another copy"),

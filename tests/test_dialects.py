@@ -14,15 +14,13 @@ import pytest
 import scipy.io
 from dialects import DT, Q, T, U, V
 from helpers import pendulum_rig
-from hypothesis import example, given, settings
-from hypothesis import strategies as st
 from recorders import imported, ns, plain_json, write_hdf5, write_mcap
 
 from nnap_em.data import formats
 from nnap_em.data.dataset import DataError
 from nnap_em.data.logs import DataWarning, read_logs
 from nnap_em.data.rig import read_rig
-from nnap_em.import_ import table_file, text_file
+from nnap_em.import_ import text_file
 from nnap_em.import_.columns import in_unit
 from nnap_em.import_.recording import Address, Topic, last_word, places
 from nnap_em.systems import specs
@@ -229,19 +227,12 @@ def test_runs_of_one_file_with_times_of_day_are_sequences(tmp_path, header, text
     _close(_imported(tmp_path / "a.csv", _rig(tmp_path)), 100, 1e-6, 3, apart=0)
 
 
-DATASET = functools.partial(dialects.matlab_object, name="logsout", kind="Simulink.SimulationData.Dataset")
-SERIES = functools.partial(dialects.matlab_object, name="theta1", kind="timeseries")
-STRUCT = "s.time = theta1.Time; s.theta1 = theta1.Data; save('log.mat', '-struct', 's', '-v7')"
-
-
 def _last(row: str, decimal: str = "."):
     """A table whose last row is another."""
     return _table(_names(";"), COLUMNS, ";", decimal, last=row)
 
 
 REFUSED = {  # what writes a file, its name, and words of the message
-    "Dataset": (DATASET, "a.mat", "variable 'logsout'", "for k = 1:logsout.numElements", "'-struct'"),
-    "timeseries": (SERIES, "a.mat", STRUCT),
     "bag": (None, "run.bag", "the file is damaged", "use another copy"),
     "db3": (None, "run.db3", "the file is damaged", "use another copy"),
     "xlsx": (None, "a.xlsx", "no workbook, or damaged", "save the sheet as CSV"),
@@ -304,23 +295,3 @@ def test_a_plain_csv_file_is_none_of_another_dialect(tmp_path):
         assert not text_file.plain_csv(dialects.table(tmp_path / "a.csv", header, (T, U, Q)))
     found = text_file.layout(["Date;Time;u;q", *9 * ["03.11.2026;12:00:00,5;0,5;1,5"]])
     assert found and (found.marks, found.first, found.clocks) == ((";", ","), 1, (1,))
-
-
-_lines = st.lists(st.lists(st.text('0159.,;-eE\t"#NameTrueX_Value[]°', max_size=7), max_size=4), max_size=9)
-
-
-@settings(deadline=None, max_examples=60)  # it writes files
-@example(rows=[["Name", "Age"], ["bob", "3"], ["eve", "4"]], separator=",")
-@example(rows=[["Channels"], ["Delta_X"], ["X_Value", "a"], ["", "4"], ["", "4"]], separator="\t")
-@given(rows=_lines, separator=st.sampled_from(",;\t "))
-def test_any_text_is_read_or_refused(tmp_path_factory, rows, separator):
-    for suffix in ("txt", "csv"):
-        path = tmp_path_factory.getbasetemp() / f"any.{suffix}"
-        path.write_text("\n".join(separator.join(row) for row in rows))
-        try:
-            text_file.plain_csv(path)
-            wanted = {topic.name: topic.fields for topic in table_file.topics(path)}
-            for track in table_file.read(path, wanted).tracks.values():
-                assert (np.diff(track.t) > 0).all()
-        except DataError as refused:
-            assert str(path) in str(refused) and ";" in str(refused)

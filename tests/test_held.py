@@ -7,7 +7,6 @@ from helpers import swing, swing_rig
 from nnap_em.data.formats import write_csv
 from nnap_em.data.held import HELD_ROWS, hold, repeats
 from nnap_em.data.logs import DataWarning, read_logs
-from nnap_em.data.plausible import repeats as copies
 from nnap_em.data.rough import rough
 
 T = 0.01 * np.arange(601)
@@ -50,15 +49,6 @@ def test_one_hold_in_a_few_rows_is_left_alone():
 @pytest.mark.parametrize("signal", (ANGLE, 0.05 * ANGLE, STOP, ANGLE + 0.05 * NOISE, 3 * T, np.round(30 * T)))
 def test_an_encoder_holds_nothing(signal, step):
     assert hold([_encoder(signal, step)]) == 1.0
-
-
-def test_a_rest_with_missing_samples_is_no_copy():
-    """Two logs that begin at rest, of which every fifth row is read."""
-    rest = np.zeros((60, 2))
-    rest[np.arange(60) % 5 > 0, 1] = np.nan
-    moving = np.random.default_rng(0).normal(size=(2, 100, 2))
-    assert list(copies({name: np.vstack([rest, rows]) for name, rows in zip("ab", moving, strict=True)})) == []
-    assert list(copies({name: np.vstack([rest, moving[0]]) for name in "ab"})) != []
 
 
 def test_missing_samples_are_no_hold():

@@ -119,26 +119,6 @@ def test_bags_of_ros_1_and_2_are_read(tmp_path, version, name):
     assert track.clock == "header stamp"
 
 
-IDL = f"""{"=" * 80}
-IDL: pkg/msg/Two
-module pkg {{ module msg {{ struct Two {{ double q; pkg::msg::One one; }}; }}; }};
-{"=" * 80}
-IDL: pkg/msg/One
-module pkg {{ module msg {{ struct One {{ double u; }}; }}; }};
-"""
-
-
-@pytest.mark.parametrize("name", ["pkg/msg/Two", "pkg/Two"])
-def test_a_schema_may_be_idl_and_its_name_short(tmp_path, name):
-    *_, encode = ros2("pkg/msg/Two", f"float64 q\nOne one\n{'=' * 80}\nMSG: pkg/One\nfloat64 u\n")
-    schema = name, "ros2idl", IDL.encode(), "cdr", encode
-    messages = [SimpleNamespace(q=q, one=SimpleNamespace(u=u)) for q, u in zip(Q[:, 0], U, strict=True)]
-    path = write_mcap(tmp_path / "a.mcap", {"/two": (schema, ns(T), messages)})
-    values = _read(path, two=("q", "one.u"))["/two"].values
-    np.testing.assert_array_equal(values["q"], Q[:, 0])
-    np.testing.assert_array_equal(values["one.u"], U)
-
-
 def _protobuf():
     """A message with a number, a list and a stamp."""
     file = descriptor_pb2.FileDescriptorProto(name="m.proto", package="robot", syntax="proto3")

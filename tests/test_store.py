@@ -1,6 +1,5 @@
 """A stored model: the same numbers to the last bit, or refused with the reason."""
 
-import errno
 import json
 import shutil
 from pathlib import Path
@@ -15,10 +14,8 @@ from nnap_em.data.dataset import Dataset
 from nnap_em.data.rig import Declared, Rig
 from nnap_em.fit.identify import Identified, begin
 from nnap_em.fit.store import fingerprint, load, read, save
-from nnap_em.smoother import AbstractSmoother, kinds
 from nnap_em.smoother.gaussian import CubatureSmoother
 from nnap_em.smoother.particle import ExactBackward, Guided, ParticleSmoother
-from nnap_em.storage import files
 from nnap_em.storage.files import StoreError
 
 ARM = {
@@ -120,26 +117,6 @@ def test_a_stored_model_keeps_its_smoother(tmp_path, windows):
     assert jax.tree.structure(loaded.smoother) == jax.tree.structure(fitted.smoother)  # statics, too
 
 
-class _Own(AbstractSmoother):
-    """Of nobody's catalogue."""
-
-    @property
-    def bytes_per_row(self):
-        return 1
-
-    def __call__(self, model, seq, *, key):
-        raise NotImplementedError
-
-
-def test_a_smoother_from_elsewhere_is_stored_once_it_is_known(tmp_path, monkeypatch):
-    fitted = begin(RIGS["slide"], _data(RIGS["slide"]), key=jax.random.key(5), smoother=lambda bank: _Own())
-    with pytest.raises(StoreError, match="its smoother '_Own' is not known here; first import what adds it"):
-        save(tmp_path / "model.npz", fitted)
-    monkeypatch.setitem(kinds, "_Own", _Own)
-    save(tmp_path / "model.npz", fitted)
-    assert isinstance(load(tmp_path / "model.npz").smoother, _Own)
-
-
 def test_settings_of_the_fit_are_kept_and_the_same_model_makes_the_same_file(tmp_path):
     fitted = _fitted("slide")
     rule = eqx.tree_at(lambda m: m.ridge, fitted.m_step, 0.25)
@@ -150,19 +127,6 @@ def test_settings_of_the_fit_are_kept_and_the_same_model_makes_the_same_file(tmp
     assert (loaded.m_step.nodes, loaded.m_step.ridge) == (31, 0.25)
     save(tmp_path / "again.npz", loaded)
     assert (tmp_path / "again.npz").read_bytes() == (tmp_path / "m.npz").read_bytes()
-
-
-def test_a_write_that_fails_leaves_the_old_file(tmp_path, file, monkeypatch):
-    old = file.read_bytes()
-
-    def full(*_):
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr(files.os, "fsync", full)
-    with pytest.raises(OSError, match=r"No space left.*model\.npz"):
-        save(file, _fitted("slide"))
-    assert file.read_bytes() == old
-    assert [path.name for path in tmp_path.iterdir()] == ["model.npz"]
 
 
 def test_a_file_of_a_version_with_more_in_it_is_read_where_that_was_empty(file):

@@ -218,7 +218,7 @@ def _decoder(encoding: str, schema: Any) -> Decode | str:
     try:
         if encoding == "json":
             return json.loads
-        if encoding == "cdr" and form in ("ros2msg", "ros2idl"):
+        if encoding == "cdr" and form == "ros2msg":
             return _cdr(schema)
         if encoding == "protobuf":
             from mcap_protobuf.decoder import DecoderFactory
@@ -233,14 +233,10 @@ def _decoder(encoding: str, schema: Any) -> Decode | str:
 
 
 def _cdr(schema: Any) -> Decode:
-    from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     package, _, kind = schema.name.partition("/")
     name = schema.name if kind.startswith("msg/") else f"{package}/msg/{kind}"  # some writers leave the middle out
-    store, text = get_typestore(Stores.EMPTY), schema.data.decode()
-    if schema.encoding == "ros2msg":
-        store.register(get_types_from_msg(text, name))
-    else:  # a file for each type, under bars
-        for part in filter(str.strip, text.split("=" * 80 + "\n")):
-            store.register(get_types_from_idl(part.partition("\n")[2] if part.startswith("IDL: ") else part))
+    store = get_typestore(Stores.EMPTY)
+    store.register(get_types_from_msg(schema.data.decode(), name))
     return lambda data: store.deserialize_cdr(data, name)

@@ -587,7 +587,7 @@ acceleration held against a speed
 an angle that is read late has no hypotheses
 - scales.speed[joint] * late <= MOVED
 + scales.speed[joint] * late <= math.inf
-# import_/segments.py
+# import_/signals.py
 ## test_import.py::test_sequences_are_cut_at_gaps[readings]
 a gap does not end a sequence
 - np.diff(signal.t) > signal.longest)

@@ -16,8 +16,7 @@ from nnap_em.data.dataset import DataError
 from nnap_em.import_ import clock
 from nnap_em.import_.files import reader
 from nnap_em.import_.resample import Resampled
-from nnap_em.import_.segments import sent_on_change
-from nnap_em.import_.signals import Signal
+from nnap_em.import_.signals import Signal, sent_on_change
 
 DT = 0.01
 RIG = pendulum_rig() + "[import]\n"

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from ..data.rig import SMOOTH, read_rig, toml_text
-from ..import_.declared import read_plan
+from ..import_.columns import read_plan
 from ..import_.folder import places, write_sequences
 from ..import_.resample import Resampled, resample
 from ..numerics.digits import counted

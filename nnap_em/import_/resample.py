@@ -14,27 +14,31 @@ from ..data.formats import refuse
 from ..data.rig import SMOOTH, Rig, nearest
 from ..data.units import other_unit
 from ..numerics.digits import counted
-from .columns import in_unit, resolve
-from .declared import LONGEST, Plan
+from .columns import LONGEST, Plan, in_unit, resolve
 from .files import read, reader
 from .readings import as_taken
 from .recording import UNTIMED, Address, Recording, Track
-from .segments import (
+from .signals import (
     FEWEST_ROWS,
+    SLOW,
     Gap,
+    Signal,
     Spans,
     Stretch,
+    averaged,
     covered,
     cut,
     gaps,
+    held,
     hold,
+    interpolated,
     longest_silence,
     present,
     reach,
     runs,
     sent_on_change,
+    straight,
 )
-from .signals import SLOW, Signal, averaged, held, interpolated, straight
 
 
 class TopicFacts(NamedTuple):

@@ -585,7 +585,7 @@ acceleration held against a speed
 an angle that is read late has no hypotheses
 - scales.speed[joint] * late <= MOVED
 + scales.speed[joint] * late <= math.inf
-# import_/segments.py
+# import_/signals.py
 ## test_import.py::test_sequences_are_cut_at_gaps[readings]
 a gap does not end a sequence
 - np.diff(signal.t) > signal.longest)
@@ -612,11 +612,11 @@ fewer rows are left out than are no sequence
 # data/formats.py
 ## test_clocks.py::test_fields_are_named_by_their_lines
 a short row is named by the line after
-- return refuse(self.path, f"line {at}"
-+ return refuse(self.path, f"line {at + 1}"
+- return refuse(self.path, f"line {self.at[k]}"
++ return refuse(self.path, f"line {self.at[k] + 1}"
 a field is named by the line before
-- f"line {self.first + line}, column {name!r}"
-+ f"line {self.first + line - 1}, column {name!r}"
+- f"line {self.at[k]}, column {name!r}"
++ f"line {self.at[k] - 1}, column {name!r}"
 # import_/text_file.py
 ## test_dialects.py::test_a_plain_csv_file_is_none_of_another_dialect
 a name that stands twice is no other dialect

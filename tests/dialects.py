@@ -1,6 +1,5 @@
 """Logs as drives, PLCs and tools write them, made from what their documentation says."""
 
-import struct
 import zipfile
 from pathlib import Path
 
@@ -159,21 +158,6 @@ def structure_with_time(path: Path) -> Path:
     content = {"out": {"time": T[:, None], "signals": signals, "blockName": "arm"},
                "u": {"time": T[:, None], "signals": drive, "blockName": "arm"}}  # fmt: skip
     scipy.io.savemat(path, content)
-    return path
-
-
-def matlab_object(path: Path, name: str, kind: str) -> Path:
-    """A MAT file of version 5 with an object of a class, as `save` writes it."""
-
-    def element(code: int, data: bytes) -> bytes:
-        return struct.pack("<II", code, len(data)) + data + b"\0" * (-len(data) % 8)
-
-    def matrix(flag: int, *parts: bytes) -> bytes:
-        return element(14, element(6, struct.pack("<II", flag, 0)) + b"".join(parts))
-
-    inner = matrix(13, element(5, struct.pack("<ii", 1, 1)), element(1, b""), element(6, struct.pack("<I", 0xDD000000)))
-    content = matrix(17, element(1, name.encode()), element(1, b"MCOS"), element(1, kind.encode()), inner)
-    path.write_bytes(b"MATLAB 5.0 MAT-file".ljust(124) + b"\x00\x01IM" + content)
     return path
 
 

@@ -12,7 +12,7 @@ from mcap.writer import CompressionType, IndexType, Writer
 from mcap_ros2._dynamic import serialize_dynamic
 
 from nnap_em.data.rig import read_rig
-from nnap_em.import_.declared import read_plan
+from nnap_em.import_.columns import read_plan
 from nnap_em.import_.resample import Resampled, resample
 from nnap_em.systems import specs
 

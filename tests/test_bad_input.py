@@ -7,13 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import csv_text, read_table, rig_text, swing, with_field
-from hypothesis import example, given, settings
-from hypothesis import strategies as st
+from helpers import csv_text, rig_text, swing, with_field
 
 from nnap_em.commands import cli
 from nnap_em.commands import identify as identify_command
-from nnap_em.data.dataset import DataError
 from nnap_em.em.loop import FitError
 
 MODEL = 'type = "pendulum"\nm = 0.5\nlc = 0.4\nI = 0.002\ng = 9.81\nfriction = "unknown"\nactuated_joint = 1\n'
@@ -216,26 +213,3 @@ def test_what_is_doubtful_is_said_before_the_fit(good, tmp_path, capsys, monkeyp
     assert last == "nnap-em: error: the fit would begin here"
     said = [line for line in warnings if line.startswith("nnap-em: warning: ")]
     assert any(all(word in line for word in words.split(" | ")) for line in said) if words else not warnings
-
-
-def _no_number(text: str) -> bool:
-    try:
-        return "_" in text or np.isinf(float(text))
-    except ValueError:
-        return bool(text.strip())  # an empty field is a missing sample
-
-
-_corrupt = st.sampled_from(["x", "-inf", "1e999", "--1", "0x10", "1_0", "1;5", "1 2", "=A1"])
-
-
-@settings(deadline=None, max_examples=60)  # it writes files
-@given(row=st.integers(0, 19), column=st.integers(0, 3), bad=_corrupt | st.text("abefnx+-.e 1").filter(_no_number))
-@example(row=0, column=0, bad="nan")
-@example(row=19, column=1, bad="")
-def test_any_corrupted_field_is_named_with_its_line_and_column(tmp_path_factory, row, column, bad):
-    path = tmp_path_factory.getbasetemp() / "corrupted.csv"
-    name = list(swing())[column]
-    path.write_text(with_field(row + 2, name, bad)(csv_text(swing(20))))
-    with pytest.raises(DataError) as refused:
-        read_table(path, ("time", "u"), ("theta1", "dtheta1"))
-    assert f"line {row + 2}, column {name!r}: found {bad.strip()!r}" in str(refused.value)

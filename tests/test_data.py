@@ -1,8 +1,6 @@
 """Logs: what is written is read back in every format, padding is marked, mistakes are refused by row and column."""
 
-import cProfile
 import dataclasses
-import pstats
 import re
 import sys
 import warnings
@@ -15,15 +13,12 @@ import pyarrow.parquet as pq
 import pytest
 import scipy.io
 from helpers import csv_text, data_sets, read_table, swing, swing_rig, with_field
-from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from nnap_em.commands.common import write_states
 from nnap_em.data.dataset import DataError, Dataset, fill_missing, horizon, pad
 from nnap_em.data.formats import write_csv
-from nnap_em.data.logs import DataWarning, check_split, logs_of_arrays, read_logs, sequences_of
-from nnap_em.data.rig import Rig, read_rig
-from nnap_em.storage.files import StoreError
+from nnap_em.data.logs import check_split, logs_of_arrays, read_logs, sequences_of
+from nnap_em.data.rig import read_rig
 from nnap_em.systems import specs
 
 ROWS, RIG = 201, swing_rig()
@@ -55,12 +50,8 @@ def test_a_folder_without_logs_is_refused(tmp_path):
 READABLE = {
     "byte order mark": lambda s: "\ufeff" + s,
     "windows lines": lambda s: s.replace("\n", "\r\n"),
-    "old Mac lines": lambda s: s.replace("\n", "\r"),
-    "no line end": lambda s: s.rstrip("\n"),
     "blank lines at the end": lambda s: s + "\n\n",
     "blanks around fields": lambda s: s.replace(",", " , "),
-    "names in quotes": lambda s: s.replace("theta1,dtheta1", '"theta1","dtheta1"'),
-    "another column": lambda s: s.replace("\n", ",note\n"),
     "UTF-16": lambda s: s.encode("utf-16"),
     "western European": lambda s: s.replace("\n", ",\n").replace(",\n", ",Wert °\n", 1).encode("cp1252"),
     "other order": lambda s: "\n".join(",".join(reversed(row.split(","))) for row in s.splitlines()),
@@ -100,48 +91,13 @@ def test_a_log_is_the_same_in_every_format(tmp_path, suffix, write):
 _values = st.floats(allow_infinity=False, allow_subnormal=False)
 
 
-@pytest.mark.parametrize("suffix, write", [*WRITERS.values()][:3], ids=[*WRITERS][:3])
-@settings(deadline=None, max_examples=40)  # it writes files
-@given(rows=st.lists(st.tuples(_values, _values), min_size=2, max_size=30), start=st.integers(0, 10**6))
-def test_any_finite_table_comes_back(tmp_path_factory, suffix, write, rows, start):
-    """To the bit, and from CSV with 12 digits; a clock of a session keeps its milliseconds."""
-    path = tmp_path_factory.getbasetemp() / f"written{suffix}"
-    t, (a, b) = start + 0.001 * np.arange(len(rows)), np.array(rows).T
-    name = 'a, "raw"' if suffix == ".csv" else "a"  # what needs quotation marks in a header
-    write(path, {"time": t, name: a, "b": b})
-    table = read_table(path, ("time",), ("b", name))
-    np.testing.assert_allclose(table[:, 0], t, rtol=0.0, atol=1e-6)
-    near = {"rtol": 1e-11, "atol": 1e-300} if suffix == ".csv" else {"rtol": 0, "atol": 0}
-    np.testing.assert_allclose(table[:, 1:].T, [b, a], **near)
-
-
-@pytest.mark.parametrize("suffix", OTHERS)
-@settings(deadline=None, max_examples=30)  # it writes files
-@given(row=st.integers(0, 49), name=st.sampled_from(list(_log())), bad=st.sampled_from([np.inf, -np.inf, np.nan]))
-def test_any_corrupted_field_is_named_with_its_row_and_column(tmp_path_factory, suffix, row, name, bad):
-    path = tmp_path_factory.getbasetemp() / f"corrupted{suffix}"
-    columns = _log()
-    columns[name][row] = bad
-    OTHERS[suffix](path, columns)
-    if np.isnan(bad) and "theta" in name:
-        assert np.isnan(read_table(path, ("time", "u"), ("theta1", "dtheta1"))[row]).any()
-        return
-    with pytest.raises(DataError) as refused:
-        read_table(path, ("time", "u"), ("theta1", "dtheta1"))
-    assert f"row {row + 1}, column {name!r}: found {bad:g}; write a number" in str(refused.value)
-
-
 MISTAKES = {  # name, which begins with the suffix: (the bytes or the columns, then the words of the message)
     "parquet: column missing": (lambda c: {n: c[n] for n in ("time", "theta1", "dtheta1")}, "'u': missing"),
     "parquet: text": (lambda c: c | {"u": ["0.1"] * 50}, "column 'u' | holds object | floating point"),
-    "parquet: one row": (lambda c: {n: v[:1] for n, v in c.items()}, "found 1 row; | 2 rows or more"),
     "parquet: no such file": (b"PAR1 and nothing", "no Parquet file, or damaged | another copy"),
     "parquet: gap": (lambda c: {n: np.delete(v, slice(9, 39)) for n, v in c.items()}, "row 10, column 'time' | a gap"),
     "mat: column misspelt": (lambda c: {n.replace("dth", "d_th"): v for n, v in c.items()}, "did you mean"),
     "mat: another length": (lambda c: c | {"u": c["u"][:-1]}, "column 'u' | is 49, the first has 50 rows | one length"),
-    "mat: a matrix": (lambda c: c | {"u": np.ones((50, 2))}, "column 'u' | missing | u[0], u[1]"),
-    "mat: complex": (lambda c: c | {"u": c["u"] + 1j}, "column 'u' | holds complex128, no numbers"),
-    "mat: text": (lambda c: c | {"u": "0.1"}, "column 'u' | no numbers | floating point"),
     "mat: cut short": (b"MATLAB 5.0 MAT-file, Platform" + 40 * b" ", "no MAT file, or damaged | another copy"),
     "mat: version 7.3": (b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM" + b"\x89HDF" * 99, "7.3 | '-v7'"),
 }
@@ -169,57 +125,6 @@ def test_only_parquet_needs_an_extra(tmp_path, monkeypatch):
     (tmp_path / "02.parquet").write_bytes(b"any")
     with pytest.raises(DataError, match=r"cannot be read without pyarrow; pip install 'nnap-em\[formats\]'"):
         read_logs(tmp_path, RIG)
-
-
-def test_whole_numbers_single_precision_and_nulls_are_read(tmp_path):
-    columns = _log() | {"u": np.arange(50, dtype=np.int32), "dtheta1": np.arange(50, dtype=np.float32)}
-    table = pa.table(columns | {"theta1": pa.array([None, *range(49)], pa.float64()), "note": ["x"] * 50})
-    pq.write_table(table, tmp_path / "01.parquet")
-    rows = read_table(tmp_path / "01.parquet", ("u",), ("theta1", "dtheta1"))
-    np.testing.assert_array_equal(rows.T, [np.arange(50), [np.nan, *range(49)], np.arange(50)])
-
-
-def test_states_replace_their_own_files_and_never_a_log(tmp_path):
-    """Those of such logs are CSV files; nothing is written beside a file that would be lost, either."""
-    for name in ("01", "02"):
-        OTHERS[".parquet"](tmp_path / f"{name}.parquet", _log())
-    logs, values, out = read_logs(tmp_path, RIG), np.zeros((2, 50, 4)), tmp_path / "out"
-    write_states(out, logs, specs["acrobot"].states, values, values)
-    assert sorted(path.name for path in out.iterdir()) == ["01.csv", "02.csv"]
-    write_states(out, logs, specs["acrobot"].states, values, values)
-    (out / "01.csv").unlink()
-    write_csv(out / "02.csv", _log())
-    log = (out / "02.csv").read_text()
-    with pytest.raises(StoreError, match=r"02\.csv: is there already, and nnap_em did not write it; move it away"):
-        write_states(out, logs, specs["acrobot"].states, values, values)
-    assert [path.read_text() for path in out.iterdir()] == [log]
-
-
-def test_a_session_clock_runs_on_over_files(tmp_path):
-    for i, start in enumerate((0.0, 3.21, 86400.0)):
-        columns = swing()
-        write_csv(tmp_path / f"{i}.csv", columns | {"time": columns["time"] + start})
-    t = read_logs(tmp_path, swing_rig(clock="session")).data.t
-    np.testing.assert_allclose(t[:, 0], [0.0, 3.21, 86400.0])
-    np.testing.assert_allclose(np.diff(t), 0.01, atol=1e-9)
-
-
-def test_what_is_unusual_and_right_passes_the_checks(tmp_path):
-    """Angles read every other row; a rig without input; and at rest the differences of a noisy angle are many times a
-    quiet rate: no units can be read from them.  A fast joint is not taken for a wrapped one.
-    """
-    rng, t = np.random.default_rng(0), 0.001 * np.arange(500)
-    write_csv(tmp_path / "1/01.csv", swing() | {"theta1": np.where(np.arange(ROWS) % 2, np.nan, swing()["theta1"])})
-    rest = {"theta1": rng.normal(0.0, 5e-3, 500), "dtheta1": rng.normal(0.0, 1e-4, 500)}
-    write_csv(tmp_path / "2/01.csv", {"time": t, "u": np.zeros(500)} | rest)
-    assert np.isnan(read_logs(tmp_path / "1", swing_rig()).data.y[0, 1::2, 0]).all()
-    rig = Rig("free", "acrobot", {}, True, (), (), 0.01, "sequence", ("theta1",), {}, {})
-    assert read_logs(tmp_path / "1", rig).data.u.shape == (1, ROWS, 0)
-    assert read_logs(tmp_path / "2", swing_rig(dt=0.001)).files == ("01.csv",)
-    t = 0.1 * np.arange(50)
-    write_csv(tmp_path / "3/01.csv", {"time": t, "u": t, "theta1": 60.0 * t, "dtheta1": 60.0 + 0.0 * t * t})
-    with pytest.warns(DataWarning):
-        read_logs(tmp_path / "3", swing_rig(dt=0.1))
 
 
 def test_padding_is_marked_and_neutral():
@@ -263,21 +168,13 @@ def test_missing_readings_become_zero_and_a_mask(kind):
     assert grad.tolist() == [6.0, 0.0]
 
 
-@pytest.mark.parametrize("t0", (0.0, 12.3, 1.7e9))
-def test_a_clock_keeps_its_samples(tmp_path, t0):
-    """1 ms at the seconds since 1970, which float64 holds to 2.4e-7 s."""
-    t = t0 + 1e-3 * np.arange(1001)
-    write_csv(tmp_path / "01.csv", {"time": t, "u": np.ones_like(t)})
-    back = read_table(tmp_path / "01.csv", ("time", "u"))[:, 0]
-    np.testing.assert_allclose(back, t, rtol=0, atol=1e-9)
-    assert t0 < 1e6 or np.array_equal(back, t)
-    assert len((tmp_path / "01.csv").read_text().splitlines()[4].split(",")[0]) < 18  # no digits of rounding
-
-
 def test_written_files_are_plain(tmp_path):
     write_csv(tmp_path / "out" / "a.csv", {"time": [0.0, 0.1, 0.3], "joint": np.arange(3), "y": [np.nan, 1 / 3, 2.5]})
     assert (tmp_path / "out" / "a.csv").read_text() == "time,joint,y\n0,0,\n0.1,1,0.333333333333\n0.3,2,2.5\n"
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["a.csv"]
+    late = 1.7e9 + 1e-3 * np.arange(3)  # a clock that 12 digits would stop
+    write_csv(tmp_path / "b.csv", {"time": late})
+    np.testing.assert_array_equal(read_table(tmp_path / "b.csv", ("time",))[:, 0], late)
 
 
 @pytest.mark.parametrize("columns", [{}, {"a": [1.0], "b": [1.0, 2.0]}, {"a": [np.inf]}])
@@ -301,26 +198,10 @@ def test_every_shared_log_is_read_without_a_word(shared):
         assert np.isfinite(test.data.y[test.data.valid]).all()
 
 
-def test_a_coarse_encoder_takes_no_more_calls_a_row_than_another(shared):
-    """Six files took 7 s when noise was estimated at standstill, and take 0.05 s: 10 calls a row (42 with checks).
-
-    Calls are counted, which are the same on a busy machine.
-    """
-    folder = shared / "data/measured/xl330"
-    rig = read_rig(folder / "rig.toml", specs)
-    read_logs(folder / "train", rig)  # modules that are loaded when they are needed
-    with cProfile.Profile() as profile:
-        logs = read_logs(folder / "train", rig)
-    assert pstats.Stats(profile).total_calls < 80 * np.sum(logs.data.valid)
-
-
 WRONG = {  # the change of arrays, and the place and finding
-    "inputs": (lambda d: d._replace(u=np.repeat(d.u, 2, axis=-1)),
-        "u has 2 columns; give those of the rig in its order: u"),
     "readings": (lambda d: d._replace(y=d.y[..., :0]),
         "y has 0 columns; give those of the rig in its order: theta1, dtheta1"),
     "dt": (lambda d: d._replace(t=2 * d.t), "sequence 0, row 1: t goes from 0 to 0.02 s, the rig has dt = 0.01 s"),
-    "ms": (lambda d: d._replace(t=1e3 * d.t), "sequence 0, row 1: t goes from 0 to 10 s"),
     "a late row": (lambda d: d._replace(t=d.t + 0.004 * (np.arange(5) == 3)),
         "sequence 0, row 3: t goes from 0.02 to 0.034 s"),
     "NaN": (lambda d: d._replace(u=np.where(np.arange(5)[:, None] == 2, np.nan, d.u)),

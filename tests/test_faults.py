@@ -25,7 +25,6 @@ import pytest
 from helpers import begun
 from shell import ENVIRONMENT
 
-from nnap_em.commands import check as check_command
 from nnap_em.commands import cli
 from nnap_em.commands import identify as identify_command
 from nnap_em.commands.identify import MISFIT_STATUS
@@ -258,48 +257,6 @@ def test_a_search_that_is_killed_stopped_and_out_of_time_goes_on_to_the_same_num
     assert [effect["name"] for effect in left["report"]["effects"]] == ["torsional_spring"]
 
 
-def test_a_folder_that_cannot_be_is_refused_before_the_work(rig, tmp_path, capsys):
-    (tmp_path / "file").write_text("")
-    assert cli.main(_order("identify", rig, tmp_path / "file" / "out")) == 2
-    assert _last_line(capsys.readouterr().err) == f"nnap-em: error: {tmp_path}/file/out: Not a directory"
-
-
-def _stop(*_, **__):
-    raise KeyboardInterrupt
-
-
-def test_ctrl_c_before_the_first_step_leaves_nothing(rig, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(identify_command, "identify", _stop)
-    assert cli.main(_order("identify", rig, tmp_path / "new")) == 130
-    assert "nothing new is kept" in _last_line(capsys.readouterr().err)
-    monkeypatch.setattr("nnap_em.commands.simulate.write_csv", _stop)
-    order = ["simulate", str(tmp_path / "new"), "--system", "slide", "--sequences", "1", "--test", "0", "--steps", "9"]
-    assert cli.main(order) == 130
-    assert _last_line(capsys.readouterr().err) == "nnap-em: stopped; the files that were written are whole"
-    assert not list(tmp_path.iterdir())
-
-
-def test_ctrl_c_that_a_garbage_collection_swallows_stops_at_the_next_line(tmp_path, monkeypatch, capsys):
-    class Litter:
-        def __del__(self):
-            os.kill(os.getpid(), signal.SIGINT)
-
-    def lost(args, log):
-        litter = Litter()
-        del litter
-        log("one line")
-        raise AssertionError
-
-    monkeypatch.setattr(sys, "unraisablehook", lambda _: None)
-    monkeypatch.setattr(check_command, "run", lost)
-    assert cli.main(["check", str(tmp_path)]) == 130
-    assert _last_line(capsys.readouterr().err) == "nnap-em: stopped; the files that were written are whole"
-    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
-
-
-# --- the journal itself
-
-
 def _flipped(content: bytes) -> bytes:
     """One bit of the numbers, which stand before the directory of the zip."""
     place = content.rindex(b"PK\x01\x02", 0, content.rindex(b"PK\x01\x02")) - 8
@@ -334,42 +291,6 @@ def test_a_step_that_is_damaged_or_of_another_version_is_done_again(tmp_path, mo
         assert done() == (name != "whole"), name
     monkeypatch.setattr(journal, "surroundings", lambda: "after an edit")
     assert done() == 12
-
-
-def _twice(counts: dict):
-    @step(lambda x, *_, **__: {"x": x, "all": (HERE, HERE, HERE), "f": jnp.tanh})
-    def work(x, options, *, factor=1.0):
-        counts["calls"] = counts.get("calls", 0) + 1
-        key = jax.random.split(options["key"])[1]
-        return {"x": jax.tree.map(lambda a: factor * a, x), "all": (key, 0.1 * factor, np.arange(3)), "f": jnp.tanh}
-
-    return work
-
-
-def _same(a, b) -> None:
-    assert jax.tree.structure(a) == jax.tree.structure(b)
-    for one, other in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
-        assert type(one) is type(other)
-        if isinstance(one, jax.Array) and jnp.issubdtype(one.dtype, jax.dtypes.prng_key):
-            one, other = jax.random.key_data(one), jax.random.key_data(other)
-        np.testing.assert_array_equal(one, other)
-
-
-def test_a_step_is_done_once_for_the_same_arguments(tmp_path):
-    counts: dict = {}
-    work = _twice(counts)
-    effect = catalogue["air_drag"](jnp.asarray(0.8), joint=1)
-    options = {"key": jax.random.key(3)}
-    plainly = work(effect, options, factor=1 / 3)
-    for _ in range(2):
-        with keeping(Journal(tmp_path / "steps")):
-            _same(work(effect, options, factor=1 / 3), plainly)
-    assert counts["calls"] == 2  # once without a journal
-    with keeping(Journal(tmp_path / "steps")):
-        work(effect, options, factor=float(np.nextafter(1 / 3, 1)))
-        work(effect, {"key": jax.random.key(4)}, factor=1 / 3)
-    assert counts["calls"] == 4
-    assert len(Journal(tmp_path / "steps").files) == 3
 
 
 def test_clearing_leaves_what_is_not_ours(tmp_path):

@@ -7,10 +7,7 @@ from helpers import swing, swing_rig
 from nnap_em.data.formats import write_csv
 from nnap_em.data.held import HELD_ROWS, hold, repeats
 from nnap_em.data.logs import DataWarning, read_logs
-from nnap_em.data.noise import reading_noise
-from nnap_em.data.plausible import repeats as copies
 from nnap_em.data.rough import rough
-from nnap_em.em.build import derivatives
 
 T = 0.01 * np.arange(601)
 ANGLE = np.sin(2.2 * T) + 0.3 * np.sin(9.1 * T + 0.4)
@@ -54,15 +51,6 @@ def test_an_encoder_holds_nothing(signal, step):
     assert hold([_encoder(signal, step)]) == 1.0
 
 
-def test_a_rest_with_missing_samples_is_no_copy():
-    """Two logs that begin at rest, of which every fifth row is read."""
-    rest = np.zeros((60, 2))
-    rest[np.arange(60) % 5 > 0, 1] = np.nan
-    moving = np.random.default_rng(0).normal(size=(2, 100, 2))
-    assert list(copies({name: np.vstack([rest, rows]) for name, rows in zip("ab", moving, strict=True)})) == []
-    assert list(copies({name: np.vstack([rest, moving[0]]) for name in "ab"})) != []
-
-
 def test_missing_samples_are_no_hold():
     assert hold([np.where(np.random.default_rng(1).random(T.size) < 0.6, np.nan, ANGLE)]) == 1.0
     assert hold([np.where(np.arange(T.size) % 4, np.nan, ANGLE)]) == 1.0
@@ -89,15 +77,3 @@ def test_repeats_are_missing_samples(tmp_path):
         assert np.flatnonzero(np.isfinite(data.y[0, :, 0])).tolist() == new.tolist()
         assert np.isfinite(data.y[0, :, 1]).all()
     assert np.isfinite(read_logs(tmp_path, swing_rig(), trust=True).data.y).all()
-
-
-@pytest.mark.parametrize("every", (1, 2, 3, 5, 10))
-def test_scales_of_readings_with_rows_between(every):
-    """Speed and acceleration of a sine, 2 and 4, and the noise on it, whichever rows hold the readings."""
-    rows = np.arange(601) % every == 0
-    y = np.where(rows, np.sin(2 * T), np.nan)
-    speed, acceleration = (np.concatenate(derivatives(y[None], order, 0.01)) for order in (1, 2))
-    assert np.max(np.abs(speed)) == pytest.approx(2.0, rel=0.01)
-    assert np.max(np.abs(acceleration)) == pytest.approx(4.0, rel=0.02)
-    noisy = np.where(rows, np.sin(0.2 * T) + 0.01 * NOISE, np.nan)
-    assert reading_noise(noisy[None]) == pytest.approx(0.01, rel=3 / np.sqrt(rows.sum()))

@@ -11,11 +11,11 @@ from helpers import rig_text, slide
 from scipy.signal import lsim
 
 from nnap_em.data.dataset import Dataset, pad
-from nnap_em.data.rig import HOLD, SMOOTH, read_rig, write_rig
+from nnap_em.data.rig import HOLD, SMOOTH, read_rig
 from nnap_em.effects import catalogue
 from nnap_em.em.build import build_system
 from nnap_em.fit.check import late
-from nnap_em.fit.inverse_dynamics import Lag, lag, regression
+from nnap_em.fit.inverse_dynamics import lag, regression
 from nnap_em.model import hooks
 from nnap_em.model.state_space import with_effects
 from nnap_em.systems import specs
@@ -126,12 +126,6 @@ def _rig(tmp_path, hold):
     return read_rig(tmp_path / "rig.toml", specs)
 
 
-def test_a_rig_is_read_back_with_its_hold(tmp_path):
-    rig = _rig(tmp_path, SMOOTH)
-    write_rig(rig, tmp_path / "again.toml")
-    assert rig.input_hold == SMOOTH and read_rig(tmp_path / "again.toml", specs) == rig
-
-
 @functools.cache
 def _recordings(hold: str, delay: float = 0.0) -> Dataset:
     """Slides of 2.1 kg with dry and viscous friction under a force in time, every 40 ms, by Runge-Kutta steps."""
@@ -178,12 +172,3 @@ def test_a_late_drive_is_no_hold(tmp_path):
     found = lag(regression(rig, build_system(rig), data), 0)
     assert abs(found.rows - 0.07 / 0.04) < 0.05 and found.counts
     assert "input_delay" in late(rig, found) and "input_hold =" not in late(rig, found)
-
-
-@pytest.mark.parametrize(
-    "rows, std, remains, counts",
-    [(-0.5, 0.05, 0.5, True), (-0.2, 0.01, 0.5, False), (-0.5, 0.11, 0.5, False), (2.0, 0.1, 0.8, False)],
-    ids=["half a row", "hardly any", "not certain", "explains little"],
-)
-def test_a_lag_counts_where_it_is_certain_and_explains(rows, std, remains, counts):
-    assert Lag(rows, std, remains).counts == counts

@@ -1,8 +1,5 @@
 """Signals of a law: every input is its own, any number of joints, and the free form of a law is of the same ones."""
 
-from typing import ClassVar
-
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -16,12 +13,11 @@ from nnap_em.diagnosis.losses import MultiStep
 from nnap_em.diagnosis.propose import proposals, surroundings
 from nnap_em.diagnosis.screen import screen
 from nnap_em.diagnosis.smoothed import SmoothedFit
-from nnap_em.effects import OperatingPoint, SearchScales, catalogue, free_form
+from nnap_em.effects import catalogue, free_form
 from nnap_em.effects.function import Axis, UnknownFunction
 from nnap_em.em.build import build
 from nnap_em.model.state_space import Inputs, with_effects
 from nnap_em.numerics.gaussian import Gaussian
-from nnap_em.systems import AbstractSystem
 
 STATES = ("theta1", "theta2", "dtheta1", "dtheta2")
 RIG = Rig(
@@ -102,47 +98,6 @@ def test_a_drive_that_gives_less_for_more_is_none(plain):
     np.testing.assert_array_equal(ends, beyond)  # nothing is learned beyond the ends
     for force, signal, possible in ((zone, axis, True), (ripple, axis, False), (ripple, place, True)):
         assert UnknownFunction(learned(force), (signal,), joint=2).is_physical() == possible
-
-
-def test_an_input_that_never_moves_is_no_signal():
-    candidates = proposals(_asked(moved=(1.0, 0.0))[-1])
-    assert not any("tau2" in c.start.inputs_named() for c in candidates)
-    assert all(np.isfinite(np.asarray(leaf)).all() for c in candidates for leaf in jax.tree.leaves(c))
-
-
-class Chain(AbstractSystem):
-    """Three links in a row, with unit masses that do not move each other."""
-
-    coordinates: ClassVar[tuple[str, ...]] = ("theta1", "theta2", "theta3")
-    rates: ClassVar[tuple[str, ...]] = ("dtheta1", "dtheta2", "dtheta3")
-    angles: ClassVar[tuple[bool, ...]] = (True, True, True)
-    joints: tuple[int, ...] = eqx.field(static=True)
-
-    def mass(self, q):
-        return jnp.eye(3)
-
-    def bias(self, q, v):
-        return jnp.sin(jnp.cumsum(q))
-
-
-def test_a_machine_with_three_joints_has_laws_at_each():
-    chain = Chain(joints=(1, 2, 3))
-    every, names = np.ones(3), (*Chain.coordinates, *Chain.rates)
-    around = SearchScales(
-        chain, every, every, every, -3 * every, 3 * every, every, names, np.ones(6), 0.01, (0.0, 5.0), 5.0, False, True,
-        ("tau1", "tau2", "tau3"),
-    )  # fmt: skip
-    q, v, u = (jnp.asarray([0.3, -0.2, 0.5]) * s for s in (1.0, 2.0, -1.0))
-    scene = OperatingPoint(chain, q, v, u, jnp.asarray(0.7), -v, jnp.negative)
-    one_each = {(c.start.name, c.start.joint): c.probes[0] for c in proposals(around)}
-    forces = jax.jit(lambda: {place: law.force(scene, jnp.zeros(law.memory)) for place, law in one_each.items()})()
-    for (_, joint), force in forces.items():
-        assert force.shape == (3,)
-        assert joint is None or set(np.flatnonzero(np.asarray(force))) <= {joint - 1}
-    for name in ("unknown_function", "cogging", "backlash", "hard_stop", "load_friction"):
-        assert {j for kind, j in one_each if kind == name} == {1, 2, 3}
-    functions = {c.start.inputs_named() for c in catalogue["unknown_function"].candidates(around)}
-    assert {("theta1", "theta2", "theta3"), ("tau3",), ("theta1", "theta3")} <= functions
 
 
 def test_every_law_of_a_place_a_rate_or_an_input_has_a_free_form(plain):

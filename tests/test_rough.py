@@ -2,21 +2,18 @@
 
 import warnings
 
-import jax
 import numpy as np
-import plant
 import pytest
 from helpers import swing, swing_rig
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from nnap_em import horizon_errors, identify, predict, read_logs, read_rig
+from nnap_em import read_logs
 from nnap_em.data.dataset import DataError
 from nnap_em.data.formats import write_csv
-from nnap_em.data.logs import DataWarning, Logs
+from nnap_em.data.logs import Logs
 from nnap_em.data.plausible import Columns
 from nnap_em.data.rough import rough
-from nnap_em.fit.check import check
 
 DT, ROWS = 0.01, 501
 NOISE = {"theta1": 0.005, "dtheta1": 0.05}
@@ -55,18 +52,6 @@ def test_spikes_are_found_row_by_row(name, level):
         rows = rng.choice(np.arange(5, ROWS - 5, 7), 5, replace=False)
         readings[name][rows] += 40 * NOISE[name] * rng.choice([-1, 1], 5)
         assert _faults(readings) == {("spike", name): set(rows.tolist())}
-
-
-def test_single_rows_are_spikes_and_a_missing_neighbour_hides_none():
-    for length in (2, 3, 10):
-        readings = _motion(length)
-        readings["theta1"][200 : 200 + length] += 1.0
-        assert _faults(readings) == {}
-    readings = _motion(3)
-    readings["theta1"][[148, 153]], readings["theta1"][150] = np.nan, 9.0
-    assert _faults(readings) == {("spike", "theta1"): {150}}
-    readings["theta1"][1::2] = np.nan
-    assert _faults(readings) == {("spike", "theta1"): {150}}
 
 
 @pytest.mark.parametrize("level", LEVELS)
@@ -109,22 +94,6 @@ def test_an_encoder_that_turns_round_pauses_or_rests_is_left_alone():
         assert _faults({"q": _resampled(way, 4e-6, rng.uniform(0.05, 0.95))}) == {}
 
 
-ONE = plant.Case(sequences=1, tests=1, steps=200, hidden=False)
-QUIET = plant.Case(sequences=4, tests=1, noise=(1e-4, 1e-3), hidden=False)
-"""At a fiftieth of the usual noise, it had alarms before two parabolas were held against a spike."""
-RIGS = {
-    "hard stop": ONE._replace(effects=plant.STRONG["hard_stop"]),
-    "reversals": QUIET._replace(seed=44),
-}
-
-
-@pytest.mark.parametrize("case", RIGS.values(), ids=RIGS)
-def test_what_machines_do_is_left_alone(case, tmp_path):
-    plant.write(case, tmp_path)
-    logs = read_logs(tmp_path / "train", read_rig(tmp_path / "rig.toml"))  # a warning would be an error
-    assert (logs.masked, logs.as_read) == ((), logs.data)
-
-
 @pytest.mark.parametrize("name", NOISE)
 @pytest.mark.parametrize("level", LEVELS)
 def test_a_sensor_that_is_stuck_or_dies_is_found_by_what_the_other_says(name, level):
@@ -142,61 +111,6 @@ def test_a_column_alone_is_stuck_where_it_wakes_up_elsewhere():
     alone = _motion(5)["theta1"]
     alone[151:201] = alone[150]
     assert _faults({"theta1": alone}) == {("stuck", "theta1"): set(range(151, 201))}
-
-
-def test_a_machine_at_rest_is_not_stuck():
-    """An encoder that stands still, moves, and stands still: its rate is 0 meanwhile."""
-    t = DT * np.arange(ROWS)
-    theta = np.where(t < 1, 0.0, np.where(t < 4, 1 - np.cos(np.pi * (t - 1)), 2.0))
-    counts = 1e-3 * np.round(theta / 1e-3)
-    rate = np.where((t > 1) & (t < 4), np.pi * np.sin(np.pi * (t - 1)), 0.0)
-    assert _faults({"theta1": counts, "dtheta1": rate}) == {}
-    assert _faults({"theta1": counts}) == {}
-    assert _faults({"theta1": np.full(ROWS, 0.25), "dtheta1": rate}) == {}  # constant: another warning
-
-
-def _arm(seed: int, step: float, noise: float, rate: str, hold: int = 1) -> Columns:
-    """Seven axes, of which one moves from pose to pose; the others rest, creep a little, or slip by some steps."""
-    rng, t = np.random.default_rng(seed), DT * np.arange(ROWS)
-    q = np.tile(rng.uniform(-2, 2, (7, 1)), ROWS)
-    for start, length in ((0.5, 1.0), (2.2, 0.7), (3.5, 0.8)):
-        q[seed % 7] += rng.uniform(-1, 1) * _ease((t - start) / length)
-    q[(seed + 1) % 7] += 2e-5 * (1 - np.exp(-t))
-    q[(seed + 2) % 7] += 5e-5 * (t > rng.uniform(1, 4))
-    speed = np.gradient(q, DT, axis=1)
-    read = q + noise * rng.standard_normal(q.shape)
-    read = step * np.round(read / step) if step else read
-    counted = np.diff(read, axis=1, prepend=read[:, :1]) / DT
-    filtered = np.zeros_like(counted)
-    for k in range(1, ROWS):
-        filtered[:, k] = 0.8 * filtered[:, k - 1] + 0.2 * counted[:, k]
-    gyro = 2e-3 * np.round((speed + 1e-3 + 3e-3 * rng.standard_normal(q.shape)) / 2e-3)
-    rates = {"counted": counted, "filtered": filtered, "gyro": gyro, "dead": np.where(abs(speed) < 5e-3, 0.0, speed)}
-    columns = {f"q{i}": y for i, y in enumerate(read)} | {f"dq{i}": y for i, y in enumerate(rates.get(rate, []))}
-    return {name: y[np.arange(ROWS) // hold * hold] for name, y in columns.items()}
-
-
-STEPS = [(0, 1e-5, 1), (1e-6, 0, 5), (1e-6, 5e-7, 1), (4e-5, 0, 1), (4e-5, 1e-5, 5), (1.5e-3, 3e-4, 5)]
-"""Steps and noise of an encoder, and rows for which its readings are held."""
-
-
-@pytest.mark.parametrize("rate", ["none", "filtered", "dead"])
-def test_axes_that_rest_on_purpose_are_left_alone(rate):
-    """Six of seven axes rest, at all steps and noises of an encoder; a rate has an offset, a delay or a threshold."""
-    for seed, (step, spread, hold) in enumerate(STEPS):
-        alarms = [entry for entry in rough(_arm(seed, step, spread, rate, hold), DT) if entry.kind != "spike"]
-        assert alarms == []
-
-
-@pytest.mark.parametrize("rate", ["counted", "gyro"])
-def test_an_axis_of_an_arm_that_sticks_while_it_moves_is_found(rate):
-    """The other side: the same arm, whose moving axis repeats a reading for half a second of its way."""
-    readings = dict(_arm(0, 4e-5, 1e-5, rate))
-    readings["q0"] = readings["q0"].copy()
-    readings["q0"][81:131] = readings["q0"][80]
-    ((kind, column, rows),) = [entry for entry in rough(readings, DT) if entry.kind != "spike"]
-    assert (kind, column) == ("stuck", "q0")
-    assert set(range(81, 131)) <= set(rows.tolist())
 
 
 def test_one_count_of_an_encoder_is_no_spike_of_its_rate():
@@ -297,34 +211,3 @@ def test_lost_rows_come_back_without_readings_and_a_log_ends_at_a_longer_gap(tmp
         _write(tmp_path, swing(), kept)
         with pytest.raises(DataError, match=r"a gap|rows are"):
             read_logs(tmp_path, swing_rig(clock="session"))
-
-
-# --- through a fit
-
-SLIDE = plant.Case(system="slide", hidden=False, sequences=6, tests=2, steps=200, noise=(5e-4, 5e-3), seed=4)
-
-
-@pytest.mark.slow  # fast: test_spikes_are_found_row_by_row
-def test_a_fit_survives_spikes_and_check_names_them(tmp_path):
-    plant.write(SLIDE, tmp_path)
-    rig = read_rig(tmp_path / "rig.toml")
-    train, test = (read_logs(tmp_path / part, rig) for part in ("train", "test"))
-    rng = np.random.default_rng(0)
-    for path in sorted((tmp_path / "train").glob("*.csv")):
-        table = np.genfromtxt(path, delimiter=",", names=True)
-        columns = {name: table[name] for name in table.dtype.names}
-        for name, std in zip(("x", "dx"), SLIDE.noise, strict=True):
-            columns[name] = columns[name] + 50 * std * (rng.random(len(table)) < 0.01)
-        write_csv(path, columns)
-    with pytest.warns(DataWarning, match="spike"):
-        spoilt = read_logs(tmp_path / "train", rig)
-
-    def error(logs: Logs) -> float:
-        fitted = identify(rig, logs.data, key=jax.random.key(0), epochs=6)
-        prediction = predict(fitted, test.data, 1.0, key=jax.random.key(0))
-        return horizon_errors(prediction, fitted, test.data, 1.0)["x"][3]
-
-    assert error(spoilt) < 1.3 * error(train)
-    rows = [f for f in check(rig, spoilt, None, key=jax.random.key(0)) if f.subject == "rough"]
-    assert [f.mark for f in rows] == ["warning", "warning"]
-    assert "x: spike: " in rows[0].text

@@ -21,8 +21,8 @@ from pathlib import Path
 from typing import Any
 
 from ..data.rig import SMOOTH, read_rig, toml_text
-from ..import_.declared import read_plan
-from ..import_.folder import completed, places, write_sequences
+from ..import_.columns import read_plan
+from ..import_.folder import places, write_sequences
 from ..import_.resample import Resampled, resample
 from ..numerics.digits import counted
 from ..report.document import versions
@@ -47,7 +47,7 @@ def run(args: argparse.Namespace, log: Log) -> None:
         files = places(logs, args.test)
         write_sequences(part, logs, files, rig)
         text = _reaching(args.rig.read_text(encoding="utf-8-sig"), args.rig.parent, args.out)
-        replace_text(part / "rig.toml", completed(text, logs[0].addresses))
+        replace_text(part / "rig.toml", text)
         names = iter(files)
         entries = [_entry(each, names) for each in logs]
         rows = sum(s["rows"] for each in entries for s in each["sequences"] if s["file"])

@@ -2,12 +2,12 @@
 
 import codecs
 import csv
+import dataclasses
 import difflib
 import functools
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import NamedTuple, NoReturn
@@ -27,7 +27,6 @@ from .units import is_time
 PLAIN = (",", ".")
 """Marks of columns and of decimals in the CSV files of a data set."""
 Table = Float[np.ndarray, "time column"]
-Rows = slice | np.ndarray
 
 
 def has_logs(folder: Path) -> bool:
@@ -55,12 +54,7 @@ def table_of(path: Path) -> "TextTable | ArrayTable":
 
 
 def columns_of(
-    table: "TextTable | ArrayTable",
-    required: Sequence[str],
-    gaps: Sequence[str] = (),
-    *,
-    dates: bool = False,
-    rows: Rows = slice(None),
+    table: "TextTable | ArrayTable", required: Sequence[str], gaps: Sequence[str] = (), *, dates: bool = False
 ) -> Table:
     """The columns `required`, then `gaps`, in file units; NaN where one of `gaps` is missing.
 
@@ -68,8 +62,8 @@ def columns_of(
     """
     path = table.path
     _check_names(path, table.names, required, gaps)
-    columns = {name: table.column(name, dates=dates, rows=rows) for name in required}
-    columns |= {name: table.column(name, gaps=True, rows=rows) for name in gaps}
+    columns = {name: table.column(name, dates=dates) for name in required}
+    columns |= {name: table.column(name, gaps=True) for name in gaps}
     count = np.size(next(iter(columns.values())))
     if count < 2:
         _too_few(path, "the file", count)
@@ -159,15 +153,15 @@ def text_lines(path: Path) -> list[str]:
     return lines
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class TextTable:
     """Rows of text under names, whose fields are split when they are read."""
 
     path: Path
     names: Sequence[str]
     lines: Sequence[str]
-    first: int = 2
-    """Line of the file in which the first row stands, from 1."""
+    at: Sequence[int]
+    """Lines of the file in which the rows stand, from 1."""
     marks: tuple[str, str] = PLAIN
     """Marks of columns and of decimals."""
 
@@ -184,37 +178,38 @@ class TextTable:
             table = read(converters=lambda text: number(text, decimal), quotechar='"')
         except ValueError:  # rows of different lengths
             table = np.zeros((0, 0))
-        if table.shape == shape and self.first == 2 and np.isinf(table[0]).all():
+        if table.shape == shape and self.at[0] == 2 and np.isinf(table[0]).all():
             hint = header_hint(self.path) or "remove the row of units"
             refuse(self.path, "line 2", f"holds no number, found {self.lines[0]!r}", hint)
         if table.shape == shape:
             return table
-        counts = (len(split(line, mark)) for line in self.lines)
-        at, count = next(((at, n) for at, n in enumerate(counts, self.first) if n != shape[1]), (self.first, 0))
-        hint = _separator_hint(*2 * [self.lines[at - self.first]])
-        hint = (
-            hint or "separate columns by ',', write decimals with '.', give every column a field; line 1 is the header"
-        )
-        problem = f"found {counted(count, 'field')} under {counted(shape[1], 'name')}"
-        return refuse(self.path, f"line {at}", problem, hint)
+        counts = [len(split(line, mark)) for line in self.lines]
+        k = next((k for k, count in enumerate(counts) if count != shape[1]), 0)
+        hint = "separate columns by ',', write decimals with '.', give every column a field; line 1 is the header"
+        problem = f"found {counted(counts[k], 'field')} under {counted(shape[1], 'name')}"
+        return refuse(self.path, f"line {self.at[k]}", problem, _separator_hint(*2 * [self.lines[k]]) or hint)
 
-    def texts(self, name: str, rows: Rows = slice(None)) -> list[str]:
+    def texts(self, name: str) -> list[str]:
         """The fields of one column."""
         i = self.names.index(name)
-        return [split(self.lines[k], self.marks[0])[i] for k in np.arange(len(self.lines))[rows].tolist()]
+        return [split(line, self.marks[0])[i] for line in self.lines]
 
-    def column(self, name: str, *, gaps: bool = False, dates: bool = False, rows: Rows = slice(None)) -> np.ndarray:
+    def column(self, name: str, *, gaps: bool = False, dates: bool = False) -> np.ndarray:
         """One column as finite numbers, or NaN where `gaps` allow that; as seconds where it has dates."""
-        values = self.values[rows, self.names.index(name)]
+        values = self.values[:, self.names.index(name)]
         dates = dates and bool(np.isinf(values[:1]).any())
-        values = moments(self.texts(name, rows)) if dates else values
+        values = moments(self.texts(name)) if dates else values
         if (k := _wrong(values, gaps)) is not None:
-            line = int(np.arange(len(self.lines))[rows][k])
-            where, text = f"line {self.first + line}, column {name!r}", repr(self.texts(name, slice(line, line + 1))[0])
+            where, text = f"line {self.at[k]}, column {name!r}", repr(self.texts(name)[k])
             if dates:
                 refuse(self.path, where, f"found {text}", "write seconds, or dates such as 2026-11-03T23:59:40.010")
             _no_number(self.path, where, text, bool(np.isnan(values[k])), gaps)
         return values
+
+    def part(self, rows: np.ndarray) -> "TextTable":
+        """Some of its rows."""
+        lines, at = ([each[k] for k in rows.tolist()] for each in (self.lines, self.at))
+        return dataclasses.replace(self, lines=lines, at=at)
 
 
 def csv_table(path: Path, lines: Sequence[str] = ()) -> TextTable:
@@ -222,24 +217,23 @@ def csv_table(path: Path, lines: Sequence[str] = ()) -> TextTable:
     first, *rows = lines or text_lines(path)
     if len(rows) < 2:
         _too_few(path, f"line {len(rows) + 1}", len(rows))
-    return TextTable(path, split(first), rows)
+    return TextTable(path, split(first), rows, range(2, len(rows) + 2))
 
 
 class ArrayTable(NamedTuple):
-    """Columns of a file that stores numbers as such, which are read one by one."""
+    """Columns of a file that stores numbers as such."""
 
     path: Path
-    columns: Mapping[str, Callable[[], np.ndarray]]
+    columns: Mapping[str, np.ndarray]
 
     @property
     def names(self) -> Sequence[str]:
         """The names of the columns."""
         return list(self.columns)
 
-    def column(self, name: str, *, gaps: bool = False, dates: bool = False, rows: Rows = slice(None)) -> np.ndarray:
+    def column(self, name: str, *, gaps: bool = False, dates: bool = False) -> np.ndarray:
         """One column as finite numbers, or NaN where `gaps` allow that; as seconds where it has dates."""
-        with _damaged(self.path):
-            values = self.columns[name]()
+        values = self.columns[name]
         if dates and values.dtype.kind in "MmOSU":
             values = dated(values)
         if values.dtype.kind not in "iuf":
@@ -249,10 +243,10 @@ class ArrayTable(NamedTuple):
         if (k := _wrong(values, gaps)) is not None:
             value = values.ravel()[k]
             _no_number(self.path, place(self.path, name, k), f"{value:g}", bool(np.isnan(value)), gaps)
-        return values[rows] if values.ndim else values
+        return values
 
 
-def _mat(path: Path) -> dict[str, Callable[[], np.ndarray]]:
+def _mat(path: Path) -> dict[str, np.ndarray]:
     """The columns of a MAT file: its vectors, those of a struct alone, and those of structs that recorders write."""
     with _damaged(path):
         try:
@@ -271,34 +265,32 @@ def _mat(path: Path) -> dict[str, Callable[[], np.ndarray]]:
             out |= {f"{name}[{i}]": each for i, each in enumerate(columns)}
         else:
             out[name] = column
-    return {name: lambda values=values: values for name, values in out.items()}
-
-
-def _parquet(path: Path) -> dict[str, Callable[[], np.ndarray]]:
-    """The columns of a Parquet file; where a row holds a list, one for each entry of the first."""
-    try:
-        from pyarrow import compute, parquet
-    except ImportError:
-        hint = "pip install 'nnap-em[formats]', or write the log as CSV"
-        raise DataError(f"{path}: cannot be read without pyarrow; {hint}") from None
-    out: dict[str, Callable[[], np.ndarray]] = {}
-    with _damaged(path):
-        file = parquet.ParquetFile(path)
-        if (rows := file.metadata.num_rows) < 2:
-            _too_few(path, "the file", rows)
-        for field in file.schema_arrow:
-            name = field.name
-            column = lambda name=name: file.read(columns=[name])[name]  # noqa: E731
-            if "list" not in str(field.type):
-                out[name] = lambda column=column: column().to_numpy()
-                continue
-            for i in range(len(next(file.iter_batches(1, columns=[name]))[0][0].as_py() or ())):
-                entry = lambda column=column, i=i: compute.call_function("list_element", [column(), i])  # noqa: E731
-                out[f"{name}[{i}]"] = lambda entry=entry: entry().to_numpy()
     return out
 
 
-_KINDS: dict[str, Callable[[Path], Mapping[str, Callable[[], np.ndarray]]]] = {
+def _parquet(path: Path) -> dict[str, np.ndarray]:
+    """The columns of a Parquet file; where a row holds a list, one for each entry."""
+    try:
+        from pyarrow import parquet
+    except ImportError:
+        hint = "pip install 'nnap-em[formats]', or write the log as CSV"
+        raise DataError(f"{path}: cannot be read without pyarrow; {hint}") from None
+    out: dict[str, np.ndarray] = {}
+    with _damaged(path):
+        table = parquet.read_table(path)
+        if (rows := table.num_rows) < 2:
+            _too_few(path, "the file", rows)
+        for name, column in zip(table.column_names, table.columns, strict=True):
+            if "list" in str(column.type):
+                entries = column.combine_chunks().flatten().to_numpy(zero_copy_only=False)
+                if entries.size % rows == 0:
+                    out |= {f"{name}[{i}]": entry for i, entry in enumerate(entries.reshape(rows, -1).T)}
+            else:
+                out[name] = column.to_numpy()
+    return out
+
+
+_KINDS: dict[str, Callable[[Path], Mapping[str, np.ndarray]]] = {
     ".csv": lambda path: {},
     ".parquet": _parquet,
     ".mat": _mat,

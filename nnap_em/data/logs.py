@@ -2,7 +2,7 @@
 
 import math
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -15,10 +15,10 @@ from .dataset import DataError, Dataset, pad
 from .formats import columns_of, header_hint, log_files, place, refuse, table_of, untimed
 from .held import hold
 from .held import repeats as held_rows
-from .plausible import Columns, implausible, repeats
+from .plausible import implausible, repeats
 from .rig import Rig
 from .rough import Rough, rough
-from .units import is_episode, other_unit
+from .units import other_unit
 
 TOLERANCE = 0.01  # of the declared dt, for every interval
 LOST = 2  # rows that follow each other over which inputs are interpolated
@@ -101,17 +101,17 @@ def read_logs(folder: Path | str, rig: Rig, *, trust: bool = False, until: float
     """
     files = [Path(folder)] if Path(folder).is_file() else log_files(Path(folder))
     tables = [_read_table(path, rig) for path in files]
-    tables = [_without(table, RANGE, _at_ends(table.readings(rig), rig), rig) for table in tables]
-    early = [table.readings(rig, until) for table in tables]
-    stands = {} if trust else {name: hold([readings[name] for readings in early]) for name in rig.measured}
-    if held := {name: rows for name, rows in stands.items() if rows > 1}:
-        again = [{name: held_rows(table.readings(rig)[name], rows) for name, rows in held.items()} for table in tables]
-        tables = [_without(table, REPEAT, rows, rig) for table, rows in zip(tables, again, strict=True)]
+    tables = [_without(table, _at_ends(table, rig), rig) for table in tables]
+    used = tables
+    if not trust:
         early = [table.readings(rig, until) for table in tables]
-    entries = [[] if trust else rough(readings, rig.dt) for readings in early]
-    sequences = [_sequence(table, each, rig) for table, each in zip(tables, entries, strict=True)]
-    data, masked = pad([used for used, _, _ in sequences]), tuple(m for *_, each in sequences for m in each)
-    unmasked = pad([as_read for _, as_read, _ in sequences]) if masked else None
+        stands = {name: hold([readings[name] for readings in early]) for name in rig.measured}
+        tables = [_without(table, _repeats(table, stands, rig), rig) for table in tables]
+        used = [_without(table, rough(table.readings(rig, until), rig.dt), rig) for table in tables]
+    for table in used:
+        _check_plausible(table, rig)
+    data, masked = pad([table.parts(rig) for table in used]), tuple(m for table in used for m in table.masked)
+    unmasked = pad([table.parts(rig) for table in tables]) if masked else None
     return Logs(tuple(path.name for path in files), data, (*rig.logged_inputs, *rig.measured), masked, unmasked)
 
 
@@ -154,14 +154,17 @@ def check_split(train: Logs, test: Logs | None = None) -> None:
 
     Warns DataWarning where other sequences overlap.  Clocks do not count.
     """
-    parts = {f"train file {file}": rows for file, rows in _contents(train)}
-    parts |= {f"test file {file}": rows for file, rows in (_contents(test) if test else ())}
+    parts = {
+        f"{part} file {file}": np.hstack(columns)
+        for part, logs in (("train", train), ("test", test))
+        if logs is not None
+        for file, (_, *columns) in zip(logs.files, _unpadded(logs.as_read), strict=True)
+    }
     for name, row, other, source_row, copy in repeats(parts):
-        leaks = name.startswith("test") and other.startswith("train")
         if copy:
             raise DataError(f"{name}: the same content as {other}; remove one of the two")
         problem = f"{name}: row {row + 1} and those after it are also in {other}, from row {source_row + 1}"
-        if leaks:
+        if name.startswith("test") and other.startswith("train"):
             raise DataError(f"{problem}; remove one of the two: test sequences are new to the fit")
         warnings.warn(f"{problem}; cut sequences without overlap", DataWarning, 2)
 
@@ -200,45 +203,48 @@ class _Table(NamedTuple):
         """Row of the file of each row of the table."""
         return np.searchsorted(self.rows, np.arange(len(self.table)))
 
+    def parts(self, rig: Rig) -> _Parts:
+        """Time, inputs, readings."""
+        return self.table[:, 0], self.table[:, 1 : -len(rig.measured)], self.table[:, -len(rig.measured) :]
+
     def readings(self, rig: Rig, until: float = math.inf) -> dict[str, Float[np.ndarray, " time"]]:
         """The columns of readings up to some seconds after the first row."""
         early = self.table[:, 0] - self.table[0, 0] <= until + TOLERANCE * rig.dt
-        return dict(zip(rig.measured, self.table[early, 1 + len(rig.logged_inputs) :].T, strict=True))
+        return dict(zip(rig.measured, self.parts(rig)[2][early].T, strict=True))
 
 
-def _at_ends(readings: Columns, rig: Rig) -> dict[str, Int[np.ndarray, " row"]]:
-    """Rows at the declared ends of the sensors, whose tangent there would be 0."""
-    outside = {name: (readings[name] <= low) | (readings[name] >= high) for name, (low, high) in rig.ranges.items()}
-    return {name: np.flatnonzero(rows) for name, rows in outside.items()}
+def _at_ends(table: _Table, rig: Rig) -> Iterator[Rough]:
+    """Readings at the declared ends of the sensors, whose tangent there would be 0."""
+    for name, (low, high) in rig.ranges.items():
+        y = table.readings(rig)[name]
+        yield Rough(RANGE, name, np.flatnonzero((y <= low) | (y >= high)))
 
 
-def _without(source: _Table, kind: str, rows: Mapping[str, Int[np.ndarray, " row"]], rig: Rig) -> _Table:
-    """A file without the readings of these rows, by column."""
+def _repeats(table: _Table, stands: Mapping[str, float], rig: Rig) -> Iterator[Rough]:
+    """Readings that stand there once more, of sensors that take each in so many rows."""
+    for name, rows in stands.items():
+        if rows > 1:
+            yield Rough(REPEAT, name, held_rows(table.readings(rig)[name], rows))
+
+
+def _without(source: _Table, entries: Iterable[Rough], rig: Rig) -> _Table:
+    """A file without these readings, with a warning for each column."""
     table, masked = source.table.copy(), list(source.masked)
-    for name, each in rows.items():
-        if each.size:
-            table[each, 1 + len(rig.logged_inputs) + rig.measured.index(name)] = np.nan
-            masked.append(_masked(source, kind, name, each))
+    for kind, column, rows in entries:
+        if rows.size:
+            line, t = int(source.line[rows[0]]), float(table[rows[0], 0])
+            table[rows, rig.measured.index(column) - len(rig.measured)] = np.nan
+            problem = f"{counted(rows.size, 'reading')} {_REASONS[kind]} ({kind}), the first at {t:.6g} s; not used"
+            hint = "" if kind == RANGE else "; to use them: --trust-readings, or read_logs(..., trust=True)"
+            warnings.warn(f"{source.path}: {place(source.path, column, line)}: {problem}{hint}", DataWarning, 2)
+            masked.append(Masked(source.path.name, kind, column, line + 1, t, rows.size))
     return source._replace(table=table, masked=masked)
-
-
-def _masked(source: _Table, kind: str, column: str, rows: Int[np.ndarray, " row"]) -> Masked:
-    """Readings of a file that are not used, with a warning."""
-    line, t = int(source.line[rows[0]]), float(source.table[rows[0], 0])
-    problem = f"{counted(rows.size, 'reading')} {_REASONS[kind]} ({kind}), the first at {t:.6g} s"
-    hint = "not used" if kind == RANGE else "not used; to use them: --trust-readings, or read_logs(..., trust=True)"
-    warnings.warn(f"{source.path}: {place(source.path, column, line)}: {problem}; {hint}", DataWarning, 2)
-    return Masked(source.path.name, kind, column, line + 1, t, rows.size)
 
 
 def _read_table(path: Path, rig: Rig) -> _Table:
     content = table_of(path)
     clock = ("time",) if "time" in content.names or header_hint(path) or untimed(content.names) else ()
     table = columns_of(content, (*clock, *rig.logged_inputs), rig.measured)
-    for name in filter(is_episode, content.names):
-        if changes := np.flatnonzero(np.diff(columns_of(content, (name,))[:, 0])).tolist():
-            hint = "`nnap-em import` it: each becomes a sequence"
-            refuse(path, place(path, name, changes[0] + 1), "another episode begins", hint)
     if not clock:
         problem = f"no column of times: rows are taken as dt = {rig.dt:g} s apart"
         warnings.warn(f"{path}: {problem}; log the time [s], so that lost rows show", DataWarning, 2)
@@ -261,21 +267,13 @@ def _check_scales(path: Path, table: Float[np.ndarray, "row column"], rig: Rig) 
                 refuse(path, place(path, column), problem, "write both in one unit")
 
 
-def _sequence(source: _Table, entries: Sequence[Rough], rig: Rig) -> tuple[_Parts, _Parts, list[Masked]]:
-    """t, u, y of one file, checked against the rig, as a fit sees them and with all readings, and what is masked."""
-    path, table, line = source.path, source.table, source.line
-    first = 1 + len(rig.logged_inputs)
-    t, u, read = table[:, 0], table[:, 1:first], table[:, first:]
-    y = read.copy()
-    for entry in entries:
-        y[entry.rows, rig.measured.index(entry.column)] = np.nan
-    for finding in implausible(dict(zip(rig.measured, y.T, strict=True)), rig.dt, rig.unit, rig.pairs()):
-        where = place(path, finding.column, None if finding.row is None else int(line[finding.row]))
+def _check_plausible(table: _Table, rig: Rig) -> None:
+    """Refuse readings that would ruin a fit, and warn of others that are seldom meant."""
+    for finding in implausible(table.readings(rig), rig.dt, rig.unit, rig.pairs()):
+        where = place(table.path, finding.column, None if finding.row is None else int(table.line[finding.row]))
         if finding.ruins:
-            refuse(path, where, finding.problem, finding.hint)
-        warnings.warn(f"{path}: {where}: {finding.problem}; {finding.hint}", DataWarning, 2)
-    masked = [*source.masked, *(_masked(source, entry.kind, entry.column, entry.rows) for entry in entries)]
-    return (t, u, y), (t, u, read), masked
+            refuse(table.path, where, finding.problem, finding.hint)
+        warnings.warn(f"{table.path}: {where}: {finding.problem}; {finding.hint}", DataWarning, 2)
 
 
 def _rows(path: Path, t: Float[np.ndarray, " time"], rig: Rig) -> Int[np.ndarray, " time"]:
@@ -326,10 +324,3 @@ def _whole(path: Path, table: Float[np.ndarray, "row column"], rows: Int[np.ndar
             problem += f" ({counted(count, 'row')} {'missing' if kind == 'gap' else 'after it'} in all)"
             warnings.warn(f"{path}: {place(path, 'time', k)}: {problem}; {hint}", DataWarning, 2)
     return _Table(path, full[:end], used, masked)
-
-
-def _contents(logs: Logs) -> Iterator[tuple[str, Float[np.ndarray, "time column"]]]:
-    """Inputs and readings of each file."""
-    u, y, valid = (np.asarray(x) for x in logs.as_read[1:])
-    for i, file in enumerate(logs.files):
-        yield file, np.hstack([u[i][valid[i]], y[i][valid[i]]])

@@ -46,6 +46,17 @@ class _Log:
         self.notes: tuple[str, ...] = ()
         self.messages: Iterator[tuple[int, int, bytes]] = iter(())
 
+    def decoded(self, number: int, data: bytes) -> Any:
+        """A message; ValueError with the reason where it cannot be read."""
+        _, _, decode = self.channels[number]
+        if isinstance(decode, str):
+            raise ValueError(decode)
+        try:
+            return decode(data)
+        except Exception as error:  # what the decoders raise on damaged bytes is open-ended
+            text = " ".join(str(error).split()) or type(error).__name__
+            raise ValueError(f"a message does not fit its schema ({text})") from None
+
 
 def topics(path: Path) -> tuple[Topic, ...]:
     """Topics of the file; it is read until the first messages of each channel were seen."""
@@ -58,18 +69,14 @@ def topics(path: Path) -> tuple[Topic, ...]:
                 if all(len(samples[i]) >= min(n, SAMPLES) for i, n in counts.items()):
                     break
         by_name: dict[str, Topic] = {}
-        for number, (name, kind, decode) in sorted(log.channels.items()):
+        for number, (name, kind, _) in sorted(log.channels.items()):
             fields: list[str] = []
-            count = log.counts.get(number, 0) if log.counts else None
-            if isinstance(decode, str):
-                kind = f"{kind}: {decode}"
-            else:
-                try:
-                    fields = [field for data in samples[number] for field in flatten(decode(data))]
-                except Exception as error:
-                    kind = f"{kind}: its messages do not fit their schema ({type(error).__name__})"
+            try:
+                fields = [field for data in samples[number] for field in flatten(log.decoded(number, data))]
+            except ValueError as error:
+                kind = f"{kind}: {error}"
             before = by_name.get(name, Topic(name, kind, 0, ()))
-            total = None if count is None or before.messages is None else before.messages + count
+            total = before.messages + log.counts.get(number, 0) if log.counts and before.messages is not None else None
             by_name[name] = Topic(name, kind, total, tuple(dict.fromkeys([*before.fields, *fields])))
     return tuple(by_name.values())
 
@@ -81,17 +88,13 @@ def read(path: Path, fields: Mapping[str, Sequence[str]]) -> Recording:
     stamps: dict[str, tuple[str, ...]] = {}
     with _opened(path) as log:
         for number, t, data in log.messages:
-            topic, _, decode = log.channels[number]
+            topic = log.channels[number].topic
             if topic not in fields:
                 continue
-            if isinstance(decode, str):
-                refuse(path, f"topic {topic!r}", decode, OTHER)
             try:
-                message = decode(data)
-            except Exception as error:  # what the decoders raise on damaged bytes is open-ended
-                problem = f"a message does not fit its schema ({' '.join(str(error).split()) or type(error).__name__})"
-                hint = "the recorder wrote another type than it said: record again, or name another topic"
-                refuse(path, f"topic {topic!r}", problem, hint)
+                message = log.decoded(number, data)
+            except ValueError as error:
+                refuse(path, f"topic {topic!r}", str(error), OTHER)
             if topic not in times:
                 stamps[topic] = _stamp(flatten(message))
                 times[topic] = array("q")
@@ -215,7 +218,7 @@ def _decoder(encoding: str, schema: Any) -> Decode | str:
     try:
         if encoding == "json":
             return json.loads
-        if encoding == "cdr" and form in ("ros2msg", "ros2idl"):
+        if encoding == "cdr" and form == "ros2msg":
             return _cdr(schema)
         if encoding == "protobuf":
             from mcap_protobuf.decoder import DecoderFactory
@@ -230,14 +233,10 @@ def _decoder(encoding: str, schema: Any) -> Decode | str:
 
 
 def _cdr(schema: Any) -> Decode:
-    from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     package, _, kind = schema.name.partition("/")
     name = schema.name if kind.startswith("msg/") else f"{package}/msg/{kind}"  # some writers leave the middle out
-    store, text = get_typestore(Stores.EMPTY), schema.data.decode()
-    if schema.encoding == "ros2msg":
-        store.register(get_types_from_msg(text, name))
-    else:  # a file for each type, under bars
-        for part in filter(str.strip, text.split("=" * 80 + "\n")):
-            store.register(get_types_from_idl(part.partition("\n")[2] if part.startswith("IDL: ") else part))
+    store = get_typestore(Stores.EMPTY)
+    store.register(get_types_from_msg(schema.data.decode(), name))
     return lambda data: store.deserialize_cdr(data, name)

@@ -1,55 +1,116 @@
-"""Addresses of the columns of a rig in a log: as declared, or by their names, in the unit that these end in."""
+"""Where columns of a rig stand in a log: as rig.toml declares, or by their names, in the unit that these end in."""
 
-import difflib
 import math
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any, NamedTuple
 
 from ..data.dataset import DataError
 from ..data.formats import refuse
-from ..data.rig import Rig
+from ..data.rig import Rig, nearest, whole_table
 from ..data.units import UNITS, factor, named_unit
 from ..numerics.digits import counted
-from .recording import OTHER, Address, Topic, places
+from .recording import OTHER, Address, Topic, address, places
+
+
+class Plan(NamedTuple):
+    """Parameters of resampling logs to one grid."""
+
+    columns: Mapping[str, Address]
+    """Addresses of columns; an absent one is found by its name."""
+    mean: bool
+    """Inputs averaged over the sample, instead of the value held at the row."""
+    gap: float | None
+    """A topic that is silent for longer [s] ends the sequence; None: a few of its intervals."""
+    shortest: float | None
+    """Shorter sequences are dropped [s]; None: 50 rows."""
+    longest: float | None
+    """Longer ones are cut [s]; None: `LONGEST`, or 500 rows where these last longer."""
+
+
+LONGEST = 30.0
+"""Sequences are cut to this, where nothing is declared [s]: a hidden joint is lost in longer ones."""
+
+
+def read_plan(path: Path, columns: tuple[str, ...]) -> Plan:
+    """Import that rig.toml, accepted by `read_rig`, declares; `columns` are those of the rig.
+
+    Raises RigError at the first mistake.
+    """
+    table = whole_table(path).table("import", absent={})
+    keys = ("columns", "input", "gap", "shortest", "longest")
+    table.check((), keys)
+    inputs = ("hold", "mean")
+    return Plan(
+        _addresses(table, columns),
+        "input" in table.items and table.choice("input", inputs) == inputs[1],
+        *(_seconds(table, key) for key in ("gap", "shortest", "longest")),
+    )
+
+
+def _addresses(table: Any, columns: tuple[str, ...]) -> dict[str, Address]:
+    if not isinstance(table.items.get("columns", {}), dict):
+        table.refuse("columns", hint="write a table [import.columns]")
+    inside = table.table("columns", absent={})
+    inside.check((), columns)
+    return {name: _address(inside, name) for name in inside.items}
+
+
+def _address(table: Any, name: str) -> Address:
+    value = table.items[name]
+    entry = value if isinstance(value, dict) else {"from": value}
+    text, scale = entry.get("from"), entry.get("scale")
+    if not isinstance(text, str) or not address(text)[1] or set(entry) - {"from", "scale"}:
+        hint = 'write "topic:field", such as "/joint_states:position[0]", or { from = "topic:field", scale = 0.001 }'
+        table.refuse(name, hint=hint)
+    wrong = isinstance(scale, bool) or not isinstance(scale, int | float) or not math.isfinite(scale) or scale == 0
+    if wrong and scale is not None:
+        table.refuse(name, f"scale is {scale!r}", "write a finite number, SI unit per unit of the log")
+    return Address(*address(str(text)), scale)
+
+
+def _seconds(table: Any, key: str) -> float | None:
+    """Seconds, which may be infinite; None where nothing is declared."""
+    value = table.items.get(key)
+    if value is not None and (type(value) not in (int, float) or not value > 0):
+        table.refuse(key, hint=f"write seconds above 0, {key} = 0.5")
+    return None if value is None else float(value)
 
 
 def resolve(
     path: Path, topics: Sequence[Topic], inputs: Sequence[str], measured: Sequence[str], declared: Mapping[str, Address]
 ) -> dict[str, Address]:
     """Address of each column of the rig; DataError with the nearest names where one is absent."""
-    out = {}
-    for name in (*inputs, *measured):
-        if name in declared:
-            out[name] = declared_at(path, topics, declared[name], name)
-        else:
-            out[name] = _by_name(path, topics, name, name in inputs)
-    return out
+    return {
+        name: declared_at(path, topics, declared[name], name) if name in declared else _by_name(path, topics, name)
+        for name in (*inputs, *measured)
+    }
 
 
-def declared_at(path: Path, topics: Sequence[Topic], address: Address, column: str) -> Address:
+def declared_at(path: Path, topics: Sequence[Topic], declared: Address, column: str) -> Address:
     """The address as the file has it: names may hold a colon, end in a unit, and count an entry that has a name."""
-    where, at = f"column {column!r} from {str(address)!r}", address.path
+    where, at = f"column {column!r} from {str(declared)!r}", declared.path
     for topic in topics:
-        there = str(address).removeprefix(f"{topic.name}:" if topic.name else "")
+        there = str(declared).removeprefix(f"{topic.name}:" if topic.name else "")
         alike = [field for field in topic.fields if there in (field, named_unit(field, brackets=True)[0])]
         if there in topic.fields or len(alike) == 1:
-            return address._replace(topic=topic.name, path=there if there in topic.fields else alike[0])
-    topic = next((topic for topic in topics if topic.name == address.topic), None)
+            return declared._replace(topic=topic.name, path=there if there in topic.fields else alike[0])
+    topic = next((topic for topic in topics if topic.name == declared.topic), None)
     if topic is None:
-        hint = near(address.topic, [topic.name for topic in topics])
-        raise DataError(f"{path}: {where}: there is no topic {address.topic!r}; {hint}")
+        hint = nearest(declared.topic, [topic.name for topic in topics])
+        raise DataError(f"{path}: {where}: there is no topic {declared.topic!r}; {hint}")
     if not topic.fields:
         refuse(path, where, f"topic {topic.name!r} ({topic.kind}) holds no numbers that can be read", OTHER)
     match = re.fullmatch(r"(.*)\[(\d+)\]", at)
     row = [name for name in topic.fields if match and re.fullmatch(re.escape(match[1]) + r"\[[^\]]*\]", name)]
     if match and int(match[2]) < len(row):
-        return address._replace(path=row[int(match[2])])
+        return declared._replace(path=row[int(match[2])])
     if match and row:
         problem = f"{match[1]!r} of {topic.name!r} has {counted(len(row), 'value')}"
         refuse(path, where, problem, f"count from 0 to {len(row) - 1}")
     owner = f"topic {topic.name!r}" if topic.name else "the table"
-    refuse(path, where, f"{owner} has no field {at!r}", near(at, topic.fields))
+    refuse(path, where, f"{owner} has no field {at!r}", nearest(at, topic.fields))
 
 
 def in_unit(path: Path, column: str, at: Address, rig: Rig) -> tuple[Address, str]:
@@ -74,36 +135,17 @@ def in_unit(path: Path, column: str, at: Address, rig: Rig) -> tuple[Address, st
     return at._replace(scale=at.scale or 1.0), note
 
 
-def _by_name(path: Path, topics: Sequence[Topic], column: str, is_input: bool) -> Address:
-    """The one place whose name is that of the column: a field, or a joint of an array of joints."""
-    names = set(_names(column, is_input))
+def _by_name(path: Path, topics: Sequence[Topic], column: str) -> Address:
+    """The one field that is called as the column, or whose path ends so."""
     every = [Address(topic.name, field) for topic in topics for field in topic.fields]
-    addresses = [at for at in every if at.path in names] or [
-        at._replace(scale=None) for at, word in places(topics) if word in names
-    ]
+    addresses = [at for at in every if at.path == column]
+    addresses = addresses or [at._replace(scale=None) for at, word in places(topics) if word == column]
     hint = f'write [import.columns] {column} = "topic:field" in rig.toml'
     if not addresses:
-        shown = [str(at) for at in every]
-        words = [re.split(r"[:.\[]", name.rstrip("]"))[-1] for name in shown]
-        raise DataError(f"{path}: column {column!r}: nothing is called so; {hint}; {near(column, shown, words)}")
+        raise DataError(
+            f"{path}: column {column!r}: nothing is called so; {hint}; {nearest(column, list(map(str, every)))}"
+        )
     if len(addresses) > 1:
         several = " and ".join(repr(str(each)) for each in addresses[:4])
         raise DataError(f"{path}: column {column!r}: may be {several}; {hint}")
     return addresses[0]
-
-
-def _names(column: str, is_input: bool) -> list[str]:
-    if is_input:
-        return [column, f"effort[{column}]"]
-    # Prefix of the name of a joint for its angle and its rate, and the array that holds them
-    parts = (("", "position"), ("d", "velocity"))
-    return [column, *(f"{array}[{column.removeprefix(d)}]" for d, array in parts if column.startswith(d))]
-
-
-def near(word: str, names: Sequence[str], words: Sequence[str] = ()) -> str:
-    """The hint for a misspelt name among many, which are called by `words`."""
-    called = {call.casefold(): name for call, name in zip(words or names, names, strict=True)}
-    close = difflib.get_close_matches(word.casefold(), called, 1)
-    question = f"did you mean {called[close[0]]!r}? " if close else ""
-    more = f", and {len(names) - 12} more" if len(names) > 12 else ""
-    return f"{question}possible here: {', '.join(names[:12]) or 'none'}{more}"

@@ -1,18 +1,15 @@
-"""Logs on the grid as a data set: which sequence is for training, its file, and rig.toml with what was found."""
+"""Logs on the grid as a data set: which sequence is for training, and its file."""
 
 import math
-import re
-import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from ..data.dataset import DataError
 from ..data.formats import write_csv
-from ..data.rig import Rig, toml_text
+from ..data.rig import Rig
 from ..numerics.digits import counted
-from .recording import Address
 from .resample import Resampled
 
 
@@ -43,21 +40,3 @@ def write_sequences(folder: Path, logs: Sequence[Resampled], files: Sequence[str
             offset = 0.0 if rig.clock == "sequence" else (log.origin - logs[0].origin) * 1e-9 + stretch.start
             time = offset + rig.dt * np.arange(stretch.rows)
             write_csv(folder / next(names), {"time": time} | dict(values))
-
-
-def completed(text: str, addresses: Mapping[str, Address]) -> str:
-    """rig.toml with a line for each column whose place was found by its name."""
-    table = tomllib.loads(text).get("import", {})
-    lines = [
-        f"{toml_text(name)} = {at.toml}    # found by its name"
-        for name, at in addresses.items()
-        if name not in table.get("columns", {})
-    ]
-    if not lines:
-        return text
-    head = re.search(r"(?m)^\[import\.columns\].*$", text)
-    if head:
-        return text[: head.end()] + "\n" + "\n".join(lines) + text[head.end() :]
-    if "columns" in table:  # written in another way, which is left as it is
-        return text
-    return text.rstrip() + "\n\n[import.columns]\n" + "\n".join(lines) + "\n"

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from ..data.dataset import DataError
 from ..data.dates import dated
@@ -34,26 +34,26 @@ def _topic(group: Any) -> Topic:
     """A group as a topic."""
     axis, fields, rows = _axis(group), [], None
     for name, data in _numeric(group):
-        if axis is not None and data == axis:
-            continue
-        if axis is None or data.shape[0] == axis.shape[0]:
+        if axis is None or (data != axis and data.shape[0] == axis.shape[0]):
             names = [name] if data.ndim == 1 else [f"{name}[{i}]" for i in range(data.shape[1])]
             unit = f" [{_unit(data)}]"
             known = named_unit(f"{name}{unit}")[1] and not named_unit(name)[1]
             fields += [f"{each}{unit}" if known else each for each in names]
             rows = data.shape[0]
-    return Topic(group.name, f"group, time in {axis.name!r}" if axis is not None else "no time axis", rows,
-                 tuple(fields))  # fmt: skip
+    return Topic(group.name, f"group, time in {axis.name!r}" if axis else "no time axis", rows, tuple(fields))
 
 
 def _track(path: Path, group: Any, paths: Sequence[str]) -> Track:
-    axis, where = _axis(group), f"group {group.name!r}"
+    axis = _axis(group)
     if axis is None:
         names = ", ".join(group) or "nothing"
         hint = "name the data set of its times `time` [s], or give it an attribute axis = 'time'"
-        refuse(path, where, f"has no time axis (holds {names})", hint)
-    values = {each: _column(group, each) for each in paths}
-    return rising(path, f"data set {axis.name!r}", _nanoseconds(path, axis), values, axis.name.rpartition("/")[2])
+        refuse(path, f"group {group.name!r}", f"has no time axis (holds {names})", hint)
+    where, name, t = f"data set {axis.name!r}", axis.name.rpartition("/")[2], axis[:]
+    unit = _unit(axis).lower().partition(" since ")[0].strip()
+    unit = unit if unit in UNITS else named_unit(name)[1]
+    t = nanoseconds(path, where, dated(t) if t.dtype.kind in "OS" else t, unit)
+    return rising(path, where, t, {each: _column(group, each) for each in paths}, name)
 
 
 def _column(group: Any, field: str) -> Float[np.ndarray, " row"]:
@@ -64,35 +64,24 @@ def _column(group: Any, field: str) -> Float[np.ndarray, " row"]:
     return np.asarray(data[:] if data.ndim == 1 else data[:, int(index)], np.float64)
 
 
-def _nanoseconds(path: Path, axis: Any) -> Int[np.ndarray, " row"]:
-    """The times, by the unit that an attribute, the name, or their size shows."""
-    t, where = axis[:], f"data set {axis.name!r}"
-    if t.dtype.kind in "OS":
-        t = dated(t)
-    unit = _unit(axis).lower().partition(" since ")[0].strip()
-    return nanoseconds(path, where, t, unit if unit in UNITS else named_unit(axis.name.rpartition("/")[2])[1])
-
-
 def _axis(group: Any) -> Any | None:
     """The times of a group: a data set marked or named so; else that of a group above it, of as many rows."""
-    inside = [(name, data) for name, data in _numeric(group, "iufOS")]
-    time_attributes = ("axis", "kind", "role", "standard_name")  # attributes that mark a data set as the time
-    for _, data in inside:
-        if data.ndim == 1 and any(_text(data.attrs.get(mark, "")).lower() == "time" for mark in time_attributes):
-            return data
-    named = [(name, data) for name, data in inside if data.ndim == 1 and is_time(name)]
-    if named:  # the stamp of a sensor may be of another clock than the times of other groups
-        return min(named, key=lambda pair: "stamp" in pair[0].lower())[1]
+    inside = [(name, data) for name, data in _numeric(group, "iufOS") if data.ndim == 1]
+    marks = ("axis", "kind", "role", "standard_name")  # attributes that mark a data set as the time
+    marked = [data for _, data in inside if "time" in (_text(data.attrs.get(mark, "")).lower() for mark in marks)]
+    # the stamp of a sensor may be of another clock than the times of other groups
+    named = sorted(filter(lambda pair: is_time(pair[0]), inside), key=lambda pair: "stamp" in pair[0].lower())
+    if marked or named:
+        return marked[0] if marked else named[0][1]
     above = None if group.name == "/" else _axis(group.parent)
-    return above if above is not None and any(data.shape[0] == above.shape[0] for _, data in inside) else None
+    return above if above and any(data.shape[0] == above.shape[0] for _, data in _numeric(group)) else None
 
 
 def _numeric(group: Any, kinds: str = "iuf") -> Iterator[tuple[str, Any]]:
     """Data sets of one number or one row of numbers per time; dates are texts."""
     for name, data in group.items():
-        if hasattr(data, "shape") and data.ndim in (1, 2) and data.dtype.kind in kinds and data.shape[0] > 1:
-            if data.ndim == 2 and data.shape[1] > LISTED_ENTRIES:
-                continue
+        wide = not hasattr(data, "shape") or data.ndim not in (1, 2) or data.shape[1:] > (LISTED_ENTRIES,)
+        if not wide and data.dtype.kind in kinds and data.shape[0] > 1:
             yield name, data
 
 

@@ -5,10 +5,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..data.counters import Counter, counter
+from ..data.counters import counter
 from ..data.held import hold, repeats
 from ..data.rig import Rig
-from ..data.rough import spikes
 from ..numerics.digits import counted
 from .signals import Signal
 
@@ -29,7 +28,7 @@ def as_taken(
             notes.append(f"{name}: each reading stands in {rows:.3g} messages: {again.size} repeats are left out")
     for name in dict.fromkeys((*rig.measured, *unwrap)):
         s, unit = out[name], rig.unit(name)
-        found = None if unit.endswith("/s") else _jumps(s, unit == "rad")
+        found = None if unit.endswith("/s") else counter(s.y, angle=unit == "rad")
         if found is None:
             notes += [f"{name} has no jumps of one size: nothing was unwrapped"] * (name in unwrap)
             continue
@@ -41,13 +40,3 @@ def as_taken(
             out[name] = replace(s, jumps=found.rows)
             notes.append(f"{text}: nothing is interpolated there; --unwrap {name} takes the jumps out")
     return out, tuple(notes)
-
-
-def _jumps(s: Signal, angle: bool) -> Counter | None:
-    """The jumps of a signal; where spikes hide them, those of the others."""
-    found = counter(s.y, angle=angle)
-    if found is None and np.max(np.abs(np.diff(s.y))) > 0.2 * np.ptp(s.y):
-        others = s.y.copy()
-        others[spikes(s.y)] = np.nan
-        found = counter(others, angle=angle)
-    return found

@@ -14,27 +14,31 @@ from ..data.formats import refuse
 from ..data.rig import SMOOTH, Rig, nearest
 from ..data.units import other_unit
 from ..numerics.digits import counted
-from .columns import in_unit, resolve
-from .declared import LONGEST, Plan
+from .columns import LONGEST, Plan, in_unit, resolve
 from .files import read, reader
 from .readings import as_taken
-from .recording import UNTIMED, Address, Recording, Topic, Track
-from .segments import (
+from .recording import UNTIMED, Address, Recording, Track
+from .signals import (
     FEWEST_ROWS,
+    SLOW,
     Gap,
+    Signal,
     Spans,
     Stretch,
+    averaged,
     covered,
     cut,
     gaps,
+    held,
     hold,
+    interpolated,
     longest_silence,
     present,
     reach,
     runs,
     sent_on_change,
+    straight,
 )
-from .signals import SLOW, Signal, averaged, held, interpolated, straight
 
 
 class TopicFacts(NamedTuple):
@@ -53,8 +57,6 @@ class TopicFacts(NamedTuple):
     """Messages per second, by the median interval."""
     jitter: float = math.nan
     """Standard deviation of the intervals that are no gap [s]."""
-    worst: float = math.nan
-    """Largest deviation from the median of an interval that is no gap [s]."""
     gaps: tuple[Gap, ...] = ()
     notes: tuple[str, ...] = ()
 
@@ -105,11 +107,15 @@ def resample(path: Path, rig: Rig, plan: Plan, shifts: Mapping[str, float], unwr
         on_change = name in rig.logged_inputs and sent_on_change(s, rig.dt)
         signals[name] = replace(s, longest=math.inf if on_change else longest_silence(s, rig.dt, plan.gap))
     rows, sequences = _gridded(path, rig, plan, signals)
+    facts = {each.name: TopicFacts(each.name, each.kind, (), each.messages) for each in topics}
+    for name, track in recording.tracks.items():
+        columns = {column: s for column, s in signals.items() if s.topic == name}
+        facts[name] = _facts(facts[name], track, clocks[name], columns)
     return Resampled(
         path,
         origin,
         addresses,
-        tuple(_facts(each, recording.tracks, clocks, addresses, signals) for each in topics),
+        tuple(facts.values()),
         rows,
         tuple(stretch for stretch, _ in sequences),
         tuple(columns for stretch, columns in sequences if not stretch.why),
@@ -152,11 +158,10 @@ def _gridded(path: Path, rig: Rig, plan: Plan, signals: Mapping[str, Signal]) ->
     _fine(path, readings, dt)
     fastest = min(readings.values(), key=lambda s: s.interval)
     spans = covered([*watched.values()], 1)
-    _sparse(path, spans, fastest, dt)
     pieces = runs(covered([spans, common, *commanded.values()], 2 + len(commanded)), fastest, dt)
     shortest = FEWEST_ROWS if plan.shortest is None else max(math.ceil(plan.shortest / dt), 2)
     longest = max(round((plan.longest or LONGEST) / dt), 2 if plan.longest else 10 * FEWEST_ROWS)
-    sequences = [_sequence(stretch, rig, plan, signals) for stretch in cut(pieces, dt, shortest, longest)]
+    sequences = [_sequence(stretch, rig, plan.mean, signals) for stretch in cut(pieces, dt, shortest, longest)]
     if all(stretch.why for stretch, _ in sequences):
         most = max((piece.rows for piece in pieces), default=0)
         problem = f"the longest stretch with all topics has {counted(most, 'row')}, a sequence needs {shortest} "
@@ -177,15 +182,6 @@ def _common(path: Path, signals: Mapping[str, Signal], spans: Mapping[str, Spans
     return np.array([[ends[late][0], ends[early][1]]])
 
 
-def _sparse(path: Path, seen: Spans, fastest: Signal, dt: float) -> None:
-    """Refuse rows that would be empty for the most part: memory is that of the readings."""
-    rows = float(np.sum(seen[:, 1] - seen[:, 0])) / dt
-    # Rows for each reading of the fastest topic from which on they are refused: without a declared gap there are 20
-    if rows > 50.0 * fastest.t.size:
-        problem = f"{rows:.3g} rows of {fastest.t.size} readings would be empty for the most part"
-        refuse(path, "[import] gap", problem, "lower it, so that sequences end where the readings do")
-
-
 def _fine(path: Path, readings: Mapping[str, Signal], dt: float) -> None:
     """Refuse a grid on which next to no row would have a reading."""
     name, best = min(readings.items(), key=lambda item: item[1].interval)
@@ -197,12 +193,12 @@ def _fine(path: Path, readings: Mapping[str, Signal], dt: float) -> None:
         refuse(path, "[sampling] dt", problem, other_unit(best.interval / dt, other))
 
 
-def _sequence(stretch: Stretch, rig: Rig, plan: Plan, signals: Mapping[str, Signal]) -> _Rows:
+def _sequence(stretch: Stretch, rig: Rig, mean: bool, signals: Mapping[str, Signal]) -> _Rows:
     """Columns of a segment; dropped is one in which a column of readings is empty, which no other command accepts."""
     if stretch.why:
         return stretch, {}
     at = stretch.start + rig.dt * np.arange(stretch.rows)
-    value = straight if rig.input_hold == SMOOTH else averaged if plan.mean else held
+    value = straight if rig.input_hold == SMOOTH else averaged if mean else held
     columns = {name: value(signals[name], at, rig.dt) for name in rig.logged_inputs}
     for name in rig.measured:
         columns[name] = interpolated(signals[name], at, rig.dt, reach(signals[name], rig.dt))
@@ -212,36 +208,17 @@ def _sequence(stretch: Stretch, rig: Rig, plan: Plan, signals: Mapping[str, Sign
 
 
 def _facts(
-    topic: Topic,
-    tracks: Mapping[str, Track],
-    clocks: Mapping[str, Float[np.ndarray, " message"]],
-    addresses: Mapping[str, Address],
-    signals: Mapping[str, Signal],
+    facts: TopicFacts, track: Track, t: Float[np.ndarray, " message"], signals: Mapping[str, Signal]
 ) -> TopicFacts:
-    """Rate, jitter and gaps of a topic that was read; of others, the entries of the file."""
-    used = tuple(name for name, at in addresses.items() if at.topic == topic.name)
-    if topic.name not in tracks:
-        return TopicFacts(topic.name, topic.kind, used, topic.messages)
-    columns = {name: s for name, s in signals.items() if s.topic == topic.name}
-    t, track = clocks[topic.name], tracks[topic.name]
+    """Rate, jitter and gaps of a topic that was read, of which these are the columns."""
     steps = np.diff(t)
-    typical = float(np.median(steps)) if steps.size else math.nan
-    silent = steps > min(s.longest for s in columns.values())
-    usual = steps[~silent] if silent.any() else steps
-    return TopicFacts(
-        topic.name,
-        topic.kind,
-        used,
-        t.size,
-        track.clock,
-        float(t[0]),
-        float(t[-1]),
-        1 / typical if typical > 0 else math.nan,
-        float(np.std(usual)) if usual.size else math.nan,
-        float(max(usual.max() - typical, typical - usual.min())) if usual.size else 0.0,
-        tuple(sorted({gap for s in columns.values() for gap in gaps(s)})),
-        track.notes,
-    )
+    usual = steps[steps <= min(s.longest for s in signals.values())]
+    rate, jitter = (1 / float(np.median(steps)), float(np.std(usual))) if usual.size else (math.nan, math.nan)
+    gone = tuple(sorted({gap for s in signals.values() for gap in gaps(s)}))
+    return facts._replace(
+        columns=tuple(signals), messages=t.size, clock=track.clock, start=float(t[0]), end=float(t[-1]), rate=rate,
+        jitter=jitter, gaps=gone, notes=track.notes,
+    )  # fmt: skip
 
 
 def _late(tracks: Mapping[str, Track], dt: float, shifts: Collection[str]) -> Iterator[str]:

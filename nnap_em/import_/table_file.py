@@ -14,7 +14,6 @@ from jaxtyping import Int
 from ..data.dataset import DataError
 from ..data.formats import (
     ArrayTable,
-    Rows,
     TextTable,
     columns_of,
     csv_table,
@@ -45,7 +44,6 @@ class Block(NamedTuple):
     clock: str | None
     day: str | None = None
     """Column of the dates beside the times."""
-    rows: Rows = slice(None)
     unit: str = ""
     """Unit of the times; empty: by their name or size."""
     dt: float = math.nan
@@ -54,23 +52,22 @@ class Block(NamedTuple):
     def times(self) -> Int[np.ndarray, " row"]:
         """The times [ns], with the dates beside them; ticks in whole numbers, of which a float holds 16 digits."""
         table, clock = self.table, self.clock or ""
-        t = columns_of(table, (clock,), dates=True, rows=self.rows)[:, 0]
+        t = columns_of(table, (clock,), dates=True)[:, 0]
         if self.unit == "ticks" and isinstance(table, TextTable):
-            every = zip(table.texts(clock, self.rows), t, strict=True)
+            every = zip(table.texts(clock), t, strict=True)
             return np.array([100 * (int(text if text.isdecimal() else x) - _TICKS_1970) for text, x in every])
-        days = (lambda: columns_of(table, (self.day or "",), dates=True, rows=self.rows)[:, 0]) if self.day else None
+        days = (lambda: columns_of(table, (self.day or "",), dates=True)[:, 0]) if self.day else None
         return nanoseconds(table.path, f"column {clock!r}", t, self.unit or named_unit(clock)[1], days)
 
     def track(self, names: Sequence[str]) -> Track:
         """Some of the columns at their times."""
         episode = [name for name in self.columns if is_episode(name)][:1]
-        read = columns_of(self.table, (*filter(None, [self.clock]), *episode), names, dates=True, rows=self.rows)
-        values = dict(zip(names, read[:, read.shape[1] - len(names) :].T, strict=True))
-        timed = self.clock is not None
+        read = columns_of(self.table, episode, names)
+        values = dict(zip(names, read[:, len(episode) :].T, strict=True))
         step = SECOND * (1.0 if math.isnan(self.dt) else self.dt)
-        t = self.times() if timed else np.round(step * np.arange(len(read))).astype(np.int64)
-        t = in_a_row(t, read[:, int(timed)]) if episode else t
-        if not timed and math.isnan(self.dt):
+        t = self.times() if self.clock else np.round(step * np.arange(len(read))).astype(np.int64)
+        t = in_a_row(t, read[:, 0]) if episode else t
+        if not self.clock and math.isnan(self.dt):
             return Track(t, values, UNTIMED, ())
         name = re.sub(r" \(\d+\)$", "", self.clock or "Delta_X")  # several clocks that are called alike
         return rising(self.table.path, f"column {self.clock!r}", t, values, name)
@@ -143,12 +140,13 @@ def _parts(path: Path, lines: Sequence[str]) -> Iterator[Block]:
         return
     rows, names = lines[found.first :], _different(found.names)
     end = next((k for k, line in enumerate(rows) if line.strip("\t ,;") == "EOF"), len(rows))
-    table = TextTable(path, names, _padded(rows[:end], found.marks[0], len(names)), found.first + 1, found.marks)
+    lines = _padded(rows[:end], found.marks[0], len(names))
+    table = TextTable(path, names, lines, range(found.first + 1, found.first + 1 + end), found.marks)
     if not found.clocks:
         filled = np.flatnonzero(~np.isnan(table.values).all(axis=1))
         columns = tuple(filter(None, names))
         _refuse_clock(table, untimed(columns) if math.isnan(found.dt) else None)
-        yield Block(table, columns, None, rows=filled, dt=found.dt)
+        yield Block(table.part(filled), columns, None, dt=found.dt)
         return
     day = clock_of(found.names)[1]
     parts: dict[bytes, list[int]] = {}
@@ -158,7 +156,7 @@ def _parts(path: Path, lines: Sequence[str]) -> Iterator[Block]:
             parts.setdefault(table.values[:, clock].tobytes(), [clock]).extend(inside)
     for clock, *inside in parts.values():
         filled = np.flatnonzero((~np.isnan(table.values[:, [clock, *inside]])).any(axis=1))
-        yield Block(table, tuple(names[i] for i in inside), names[clock], day, filled, found.unit)
+        yield Block(table.part(filled), tuple(names[i] for i in inside), names[clock], day, found.unit)
 
 
 def _padded(lines: Sequence[str], mark: str, width: int) -> list[str]:
@@ -192,5 +190,5 @@ def _codesys(path: Path, lines: Sequence[str]) -> Iterator[Block]:
         elif key == "Flags" and rest and rest[0].isdecimal() and int(rest[0]) & 32:
             unit = "us"
     for name, (first, rows) in parts.items():
-        table = TextTable(path, ("time", name), rows, first, (";", "."))
+        table = TextTable(path, ("time", name), rows, range(first, first + len(rows)), (";", "."))
         yield Block(table, (name,), "time", unit=unit)

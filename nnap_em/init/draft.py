@@ -15,8 +15,7 @@ from ..data.rig import SystemSpec, toml_key, toml_text
 from ..data.units import named_unit, parameter_unit, si
 from ..import_.files import read, reader
 from ..import_.recording import UNTIMED, Address, Topic, last_word, places
-from ..import_.segments import reach
-from ..import_.signals import Signal, interpolated
+from ..import_.signals import Signal, interpolated, reach
 
 _NAMES = {  # what people call a column, its number apart
     "time": re.compile(r"_*(time|t|timestamp|clock)()$"),

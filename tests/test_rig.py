@@ -6,12 +6,11 @@ import shutil
 import tomllib
 
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from nnap_em.commands import cli
 from nnap_em.data.limits import Bounds
-from nnap_em.data.rig import Declared, Rig, RigError, SystemSpec, flat, read_rig, write_rig
+from nnap_em.data.rig import Declared, Rig, RigError, SystemSpec, read_rig, write_rig
+from nnap_em.data.table import flat
 from nnap_em.data.units import parameter_unit
 from nnap_em.systems import specs
 
@@ -19,8 +18,6 @@ STATES = ("theta1", "theta2", "dtheta1", "dtheta2")
 REQUIRED = ("m1", "m2", "l1", "l2", "lc1", "lc2", "I1", "I2", "g")
 SYSTEMS = {
     "acrobot": SystemSpec(STATES, REQUIRED, {"Ir": 0.0, "gr": 1.0}, joints=2),
-    "slide": SystemSpec(("x", "dx"), ("m",), {}, joints=1),
-    "own": SystemSpec(("x", "dx"), ("mc", "mu", "lag", "lc", "Imax"), {}, joints=1),
 }
 
 GOOD = """\
@@ -60,40 +57,10 @@ theta2 = { mean = 0.0, std = 0.5 }
 """
 
 
-OWN = (
-    GOOD[: GOOD.index("m1 =")].replace("acrobot", "own")
-    + """\
-mc = 1.0
-mu = 0.0
-lag = -0.1
-lc = 0.0
-Imax = -3.0
-friction = "none"
-actuated_joint = 1
-"""
-    + GOOD[GOOD.index("\n[sampling]") : GOOD.index("\n[measurement]")]
-    + """
-[measurement]
-columns = ["x"]
-"""
-)
-
-
 def _read(tmp_path, text):
     path = tmp_path / "rig.toml"
     path.write_text(text, encoding="utf-8")
     return read_rig(path, SYSTEMS)
-
-
-def test_names_of_ones_own_are_no_masses_and_lengths(tmp_path):
-    rig = _read(tmp_path, OWN)
-    assert (rig.parameters["mu"].mean, rig.parameters["lag"].mean) == (0.0, -0.1)
-    units = {"mc": "kg", "mu": "SI", "lag": "SI", "lc": "m", "Imax": "SI", "m1": "kg", "lc2": "m", "I2": "kg m^2"}
-    assert {name: parameter_unit(name) for name in units} == units
-    with pytest.raises(RigError, match=r"mc: found 0\.0; write a mass above 0"):
-        _read(tmp_path, OWN.replace("mc = 1.0", "mc = 0.0"))
-    with pytest.raises(RigError, match=r"lc: found -0\.1; write 0 or more \[m\]"):
-        _read(tmp_path, OWN.replace("lc = 0.0", "lc = -0.1"))
 
 
 def test_all_that_is_declared_is_read(tmp_path):
@@ -106,6 +73,8 @@ def test_all_that_is_declared_is_read(tmp_path):
     assert (rig.input_columns, rig.input_joints) == (("tau1", "tau2"), (1, 2))
     assert (rig.measured, rig.noise_std) == (("theta1", "dtheta1"), {"theta1": 0.005})
     assert rig.start == {"theta2": Declared(0.0, 0.5)}
+    units = {"mc": "kg", "mu": "SI", "lag": "SI", "lc": "m", "Imax": "SI", "m1": "kg", "lc2": "m", "I2": "kg m^2"}
+    assert {name: parameter_unit(name) for name in units} == units
 
 
 NO_INPUT = re.sub(r"\[input\]\n.*\n.*\n", "", GOOD)
@@ -120,54 +89,29 @@ def test_tables_may_be_absent_and_marks_and_lines_those_of_windows(tmp_path):
     assert _read(tmp_path, "\ufeff" + GOOD.replace("\n", "\r\n")) == _read(tmp_path, GOOD)
 
 
-INPUT = '[input]\ncolumns = ["tau1", "tau2"]\njoints = [1, 2]'
 MISTAKES = {  # name: (in GOOD, instead, and the message: place | finding | hint)
     "syntax": ("dt = 0.01", "dt = ", "line 22 | not TOML | key = value"),
-    "key twice": ("m2 = 0.25", "m2 = 0.25\nm2 = 0.3", "line 8 | not TOML | no key twice"),
     "format of the future": ("format = 1", "format = 2", "format: | found 2 | write format = 1"),
-    "name empty": ('"bench"', '""', "name: | found '' | name = \"my_rig\""),
-    "table misspelt": ("[sampling]", "[sampling_]", "sampling_: | unknown table | did you mean 'sampling'?"),
     "measurement missing": (GOOD[GOOD.index("[measurement]") :], "", "measurement: | missing | [measurement] with"),
     "model no table": (GOOD[GOOD.index("[model]") :], "model = 3\n[sampling]\n[measurement]", "model: | 3 | a table"),
     "type unknown": ('"acrobot"', '"Acrobat"', "[model] type: | 'Acrobat' | did you mean 'acrobot'?"),
-    "parameter missing": ("lc2 = 0.1425\n", "", "[model] lc2: | missing | lc2 = { mean = 0.2, std = 0.02 }"),
     "parameter misspelt": ("lc2", "cl2", "[model] cl2: | unknown | did you mean 'lc2'?"),
-    "parameter a text": ("m2 = 0.25", 'm2 = "0.25"', "[model] m2: | '0.25' | finite number"),
     "parameter a boolean": ("m2 = 0.25", "m2 = true", "[model] m2: | True | finite number"),
-    "parameter nan": ("m2 = 0.25", "m2 = nan", "[model] m2: | nan | finite number"),
     "mass negative": ("m2 = 0.25", "m2 = -0.25", "[model] m2: | -0.25 | mass above 0 [kg]"),
-    "mass uncertain and negative": ("mean = 0.2,", "mean = -0.2,", "[model] m1: | -0.2 | mass above 0"),
     "length negative": ("lc1 = 0.1", "lc1 = -0.1", "[model] lc1: | -0.1375 | 0 or more [m]"),
-    "gravity negative": ("g = 9.81", "g = -9.81", "[model] g: | -9.81 | 0 or more [m/s^2]"),
     "std negative": ("std = 0.02", "std = -0.02", "[model.m1] std: | -0.02 | 0 (trusted) or more"),
-    "std missing": (", std = 0.02", "", "[model.m1] std: | missing | { mean = 0.2, std = 0.02 }"),
     "std misspelt": ("std = 0.02", "sd = 0.02", "[model.m1] sd: | unknown | did you mean 'std'?"),
-    "friction missing": ('friction = "unknown"', "", '[model] friction: | missing | "none"'),
     "friction unheard of": ('"unknown"', '"unknwon"', "[model] friction: | 'unknwon' | did you mean 'unknown'?"),
-    "actuated joint a text": (
-        GOOD,
-        NO_INPUT.replace("friction", 'actuated_joint = "elbow"\nfriction'),
-        "[model] actuated_joint: | found 'elbow'",
-    ),
-    "no input at all": (INPUT, "", "[model] actuated_joint: | missing | actuated_joint = 2"),
+    "no input at all": (GOOD, NO_INPUT, "[model] actuated_joint: | missing | actuated_joint = 2"),
     "joint out of range": ("[1, 2]", "[1, 3]", "[input] joints: | [1, 3] | from 1 to 2"),
     "joint twice": ("[1, 2]", "[1, 1]", "[input] columns: | tau1 and tau2 drive one joint | log their sum"),
-    "joint a boolean": ("[1, 2]", "[true, 2]", "[input] joints: | True | numbers from 1 to 2"),
     "joint missing": ("[1, 2]", "[1]", "[input] joints: | 1 joints for 2 columns | one per column"),
-    "input twice": ('"tau2"', '"tau1"', "[input] columns: | ['tau1', 'tau1'] | different names"),
     "input the time": ('"tau2"', '"time"', "[input] columns: | 'time' | torque columns only"),
     "input key unknown": ("joints =", "joint =", "[input] joint: | unknown | did you mean 'joints'?"),
-    "dt zero": ("dt = 0.01", "dt = 0", "[sampling] dt: | found 0 | above 0"),
     "hold of second order": ("zero-order", "second-order", "[sampling] input_hold: | 'second-order' | first-order"),
-    "clock unheard of": ('"sequence"', '"wall"', "[sampling] clock: | 'wall' | possible here: sequence, session"),
-    "nothing measured": ('["theta1", "dtheta1"]', "[]", '[measurement] columns: | [] | columns = ["theta1"'),
     "measured no state": ('"dtheta1"]', '"thteta1"]', "[measurement] columns: | 'thteta1' | did you mean 'theta1'?"),
-    "measured twice": ('"dtheta1"]', '"theta1"]', "[measurement] columns: | ['theta1', 'theta1'] | different names"),
-    "noise zero": ("theta1 = 0.005", "theta1 = 0", "[measurement.noise_std] theta1: | found 0 | above 0"),
     "noise unmeasured": ("theta1 = 0.005", "theta2 = 0.005", "[measurement.noise_std] theta2: | unknown | theta1"),
-    "noise no table": ("[measurement.noise_std]\ntheta1 =", "noise_std =", "[measurement] noise_std: | 0.005 | table"),
     "start of no state": ("theta2 = {", "theta3 = {", "[start] theta3: | unknown | did you mean 'theta"),
-    "start a number": ("theta2 = { mean = 0.0, std = 0.5 }", "theta2 = 0.0", "[start] theta2: | 0.0 | { mean = 0.2"),
     "another encoding": ("bench", "Prüfstand", "line 2 | not UTF-8 | save the file as plain UTF-8 text"),
 }
 
@@ -198,42 +142,6 @@ def test_every_mistake_is_named_at_once(tmp_path, capsys):
     assert places == ["[start] x", "[start] y", "[measurement] columns"]
 
 
-_numbers = st.floats(1e-300, 1e6)
-_signed = st.floats(-1e6, 1e6, allow_subnormal=False)  # programs of XLA leave a processor that flushes them to 0
-_declared = st.builds(Declared, _signed, st.just(0.0) | _numbers)
-_lengths = st.builds(Declared, _numbers, st.just(0.0) | _numbers)
-_names = st.text(st.characters(codec="utf-8"), min_size=1).filter(lambda name: name not in ("time", *STATES))
-_fields = st.fixed_dictionaries(
-    dict(
-        name=_names,
-        system=st.just("acrobot"),
-        parameters=st.fixed_dictionaries(
-            {name: _declared if name.startswith("I") else _lengths for name in REQUIRED}, optional={"gr": _declared}
-        ),
-        friction=st.booleans(),
-        input_columns=st.tuples(_names),
-        input_joints=st.sampled_from([(1,), (2,)]),
-        dt=_numbers,
-        clock=st.sampled_from(["sequence", "session"]),
-        measured=st.just(("theta1", "dtheta1")),
-        noise_std=st.fixed_dictionaries({}, optional={"theta1": _numbers, "dtheta1": _numbers}),
-        start=st.dictionaries(st.sampled_from(STATES), _declared),
-    )
-)
-
-
-@pytest.mark.filterwarnings("ignore::nnap_em.data.rig.RigWarning")  # of a link of a mile
-@settings(deadline=None)  # it writes files
-@given(fields=_fields)
-def test_what_is_written_is_read_back(tmp_path_factory, fields):
-    rig = Rig(**fields)
-    path = tmp_path_factory.getbasetemp() / "written" / "rig.toml"
-    write_rig(rig, path)
-    assert read_rig(path, SYSTEMS) == rig
-    if not rig.parameters["m1"].std:
-        assert f"m1 = {rig.parameters['m1'].mean!r}    # kg" in path.read_text()
-
-
 def test_every_shared_rig_is_read_and_written_back(shared, tmp_path):
     paths = sorted((shared / "data").glob("*/*/rig.toml"))
     assert paths
@@ -247,7 +155,7 @@ def test_every_shared_rig_is_read_and_written_back(shared, tmp_path):
         assert read_rig(tmp_path / "rig.toml", specs) == rig
 
 
-ODD = ("joint 1 [rad]", "a.b", 'Gelenk ä"', "limits", "x#y", "-", "1")
+ODD = ("joint 1 [rad]", "a.b", 'Gelenk ä"', "limits")
 
 
 @pytest.mark.parametrize("name", ODD)
@@ -263,7 +171,8 @@ def test_a_name_of_any_letters_comes_back(tmp_path, name):
     )  # fmt: skip
     rig = dataclasses.replace(rig, parameters={**rig.parameters, f"u {name}.kv": Declared(2.0, 0.5)})
     write_rig(rig, tmp_path / "rig.toml")
-    table = tomllib.loads((tmp_path / "rig.toml").read_text())
+    table = tomllib.loads(text := (tmp_path / "rig.toml").read_text())
+    assert "dt = 0.01    # s\n" in text
     assert table["start"] == {f"d{name}": {"mean": 0.0, "std": 1.0}} and table["name"] == name
     assert set(dict(flat(table["measurement"]["noise_std"]))) == {name, f"d{name}"}
     assert table["limits"] == {f"d{name}": [-1.0, 2.0], "rate": {f"u {name}": [-3.0, 3.0]}, "start": {name: [0.5, 0.5]}}

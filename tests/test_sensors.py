@@ -31,8 +31,7 @@ from nnap_em.export.mjcf import write_mjcf
 from nnap_em.export.model import parameters
 from nnap_em.fit.identify import begin
 from nnap_em.fit.store import load, save
-from nnap_em.import_.recording import Topic
-from nnap_em.init.from_machine import draft_machine, sensors
+from nnap_em.init.from_machine import draft_machine
 from nnap_em.machines.mjcf import read_machine
 from nnap_em.model.base import prepare
 from nnap_em.model.friction import FixedFriction, NoFriction
@@ -206,7 +205,6 @@ def test_sensors_are_called_by_name_and_component_with_their_units(tmp_path):
 
 BAD = {
     "no component": ("hand_gyro", "'hand_gyro' is no state or sensor of this system; did you mean 'hand_gyro."),
-    "no such component": ("hand_gyro.w", "'hand_gyro.w' is no state or sensor of this system; did you mean"),
     "another kind": (
         "hand_touch", "of a sensor of type touch; read are joints, and gyro, accelerometer, framepos of a site: take",
     ),
@@ -259,7 +257,7 @@ def test_sensors_are_shown_exported_stored_and_written_back(tmp_path):
         np.testing.assert_allclose(again[sensor.name].place, sensor.place, atol=1e-11)
 
 
-def test_a_first_rig_has_the_sensors_of_the_log_by_name_or_as_ros_calls_them(tmp_path):
+def test_a_first_rig_has_the_sensors_of_the_log_by_name(tmp_path):
     (tmp_path / "swing.xml").write_text(SWING)
     t = 0.01 * np.arange(200)
     header = {"time": t, "pivot": np.sin(t), "imu.x": np.cos(t), "shake.z": np.sin(3 * t), "push": np.cos(2 * t)}
@@ -268,11 +266,6 @@ def test_a_first_rig_has_the_sensors_of_the_log_by_name_or_as_ros_calls_them(tmp
     (tmp_path / "rig.toml").write_text(made.text)
     assert read_rig(tmp_path / "rig.toml", specs).measured == ("pivot", "imu.x", "shake.z")
     assert re.findall(r'(?m)^"(?:imu.x|shake.z)" = .*# (.*)$', made.text) == ["rad/s", "m/s^2"]
-    fields = tuple(f"{kind}.{axis}" for kind in ("angular_velocity", "linear_acceleration") for axis in "xyz")
-    columns = sensors(read_machine(tmp_path / "swing.xml"), [Topic("/imu", "sensor_msgs/msg/Imu", 10, fields)])
-    assert {name: str(at) for name, at in columns.items() if name[-1] == "y"} == {
-        "imu.y": "/imu:angular_velocity.y", "shake.y": "/imu:linear_acceleration.y",
-    }  # fmt: skip
 
 
 @pytest.mark.slow  # fast: test_what_accelerometers_feel_of_friction_and_mass_counts_in_score_and_information

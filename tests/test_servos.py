@@ -11,20 +11,20 @@ import pytest
 from helpers import PENDULUM, rig_text, servo_model, written_again
 
 from nnap_em.data.dataset import Dataset
-from nnap_em.data.logs import OTHER_UNIT, DataError, read_logs
+from nnap_em.data.logs import DataError, read_logs
 from nnap_em.data.rig import Declared, Rig, RigError, read_rig
 from nnap_em.data.servo import KINDS
 from nnap_em.diagnosis.columns import candidate_columns, tracks
 from nnap_em.effects import Candidate
-from nnap_em.effects.actuator import DeadZone, InputDelay, MotorGain, Saturation
+from nnap_em.effects.actuator import InputDelay, MotorGain, Saturation
 from nnap_em.em.build import build, build_system, measure_scales
-from nnap_em.em.servos import build_servos, steps_of_sample, torque_along
+from nnap_em.em.servos import build_servos
 from nnap_em.export.model import ExportError, write_model
 from nnap_em.fit.identifiability import identifiability, sentences
 from nnap_em.fit.identify import begin
 from nnap_em.fit.store import load, save
 from nnap_em.model.servo import LAWS
-from nnap_em.model.state_space import MOST_STEPS, with_effects
+from nnap_em.model.state_space import with_effects
 from nnap_em.numerics.gaussian import Gaussian
 from nnap_em.systems import specs
 
@@ -135,14 +135,6 @@ def test_a_late_command_is_that_of_earlier_rows_and_stood_before_the_first(tmp_p
     np.testing.assert_allclose(other.u, late.u, rtol=1e-12)
 
 
-def test_laws_of_a_moment_act_on_the_torque_of_a_servo(tmp_path):
-    plain = _servo(tmp_path, 'kind = "position"\nkp = 3.0\nkd = 0.5')
-    torque = 3.0 * (2.0 - 0.4) + 0.5
-    laws = MotorGain.of(-0.2, joint=1), DeadZone.of(0.3, joint=1), Saturation.of(1.5, joint=1)
-    drives = _drives([servo_model(plain, (law,)) for law in laws], [[0.4, -1.0]], [[2.0]])
-    np.testing.assert_allclose(np.ravel(drives), [0.8 * torque, torque - 0.3, 1.5], rtol=1e-12)
-
-
 def test_a_voltage_is_a_velocity_servo_of_its_own_gain(tmp_path):
     k, r = 0.3, 2.0
     driven = servo_model(_servo(tmp_path, f'kind = "voltage"\nk = {k}\nR = {r}\nlimit = 0.4\nbias = 0.01'))
@@ -242,25 +234,16 @@ LIMIT = "limit = { mean = 0.6, std = 0.0, at = { supply = 7.4 } }"
 BAD_LINES = {
     "no gain": (SERVO, r"\[input\] kp: missing: the input 'goal' of kind 'position' needs its kp; write"),
     "no kind": ("kp = 3.0", r"\[input\] kp: no input has a kp \(kinds: torque\); write kind = \"position\""),
-    "unknown kind": ('kind = "positon"\nkp = 3.0', "'positon'; did you mean 'position'"),
     "negative gain": (f"{SERVO}kp = -3.0", r"found -3; write a number above 0 \[N m/rad\]"),
-    "early": (f"{SERVO}kp = 3.0\ndelay = -0.01", r"delay: found -0.01; write 0 or more \[s\]"),
     "of another kind": (
         '[input.goal]\nkind = "velocity"\nkp = 3.0',
         r"\[input.goal\] kp: an input of kind 'velocity' has no kp; possible are kv, bias",
     ),
-    "a joint without input": (
-        '[input.elbow]\nkind = "position"\nkp = 3.0',
-        "no input column is called 'elbow'; name it in columns and its joint in joints",
-    ),
-    "half a pair": (f"{SERVO}kp = {{ mean = 3.0 }}", r"\[input.kp\] std: missing"),
-    "at no table": (SERVO + KP.partition(", at")[0] + ", at = 200.0 }", r"\[input.kp\] at: found 200.0; write at = {"),
-    "at zero": (SERVO + KP.replace("7.4", "0"), r"\[input.kp.at\] supply: found 0; write the value of that column at"),
+    "at zero": (SERVO + KP.replace("7.4", "0"), r"\[input.kp.at\] supply: found 0; write a number above 0"),
     "at a state": (SERVO + KP.replace("supply", "theta1"), "at: 'theta1' is the time, a state or an input; name a col"),
     "late by a column": (
         f"{SERVO}{KP}\ndelay = {{ mean = 0.01, std = 0.0, at = {{ gain = 1.0 }} }}", "the same in all rows; take it",
     ),
-    "misspelt": (SERVO + KP.replace("at =", "att ="), r"\[input.kp\] att: unknown table or key; did you mean 'at'"),
 }  # fmt: skip
 
 
@@ -272,15 +255,13 @@ def test_a_mistake_is_refused_with_its_mend(tmp_path, lines, message):
 
 
 BAD_FILES = {
-    "muscle": ("<muscle name='goal' joint='a' lengthrange='0 1'/>", "actuator 'goal' is a muscle; log the torque"),
-    "integrated": (
-        "<intvelocity name='goal' joint='a' kp='3' actrange='-1 1'/>",
-        "'goal' has a state of its own; log the goal that it has integrated and make it <position>",
+    "muscle": (
+        "<muscle name='goal' joint='a' lengthrange='0 1'/>",
+        "actuator 'goal' is no motor, .*gain: muscle.*; log the torque",
     ),
-    "lag": ("<position name='goal' joint='a' kp='3' timeconst='.1'/>", "a state of its own; take the lag out of it"),
     "gain by position": (
         "<general name='goal' joint='a' gaintype='affine' gainprm='1 2 0'/>",
-        "the gain of actuator 'goal' changes with position",
+        r"actuator 'goal' is no motor, servo or damper",
     ),
     "one-sided": (
         "<position name='goal' joint='a' kp='3' forcerange='-1 2'/>",
@@ -311,11 +292,6 @@ def test_what_scales_with_the_gain_and_what_friction_does_is_said(tmp_path):
     assert identifiability(known, build_system(known), build_servos(known)) == ((), (rubbed,))
     bare = dataclasses.replace(known, friction=False)
     assert identifiability(bare, build_system(bare), build_servos(bare)) == ((), ())
-
-
-def test_a_servo_that_no_integration_step_can_follow_is_an_error(tmp_path):
-    rig = _servo(tmp_path, f"{SERVO}kp = 1.0e8")
-    assert steps_of_sample(build_system(rig), build_servos(rig), _logs(np.ones((1, 9, 1))), 0.01) > MOST_STEPS
 
 
 def test_the_size_of_a_torque_that_nobody_logs_is_that_of_the_servo(tmp_path):
@@ -373,22 +349,6 @@ def test_numbers_are_proportional_to_their_columns(tmp_path):
     assert 0 < np.sum(np.abs(torque) > limit) < 40
 
 
-def test_scales_of_the_fit_are_those_of_the_gains_in_the_logs(tmp_path):
-    """The size of the torque and the step of integration, against those of plain numbers."""
-    rig = _servo(tmp_path, SERVO + KP)
-    data = read_logs(_log(tmp_path), rig).data
-    plain = _servo(tmp_path, SERVO + f"kp = {3.0 * GAIN / 200.0 * SUPPLY / 7.4!r}")
-    bare, system = data._replace(u=data.u[..., :1]), build_system(rig)
-    steps = [steps_of_sample(system, build_servos(r), d, 0.01) for r, d in ((rig, data), (plain, bare))]
-    np.testing.assert_allclose(*steps, rtol=1e-12)
-    one, two = (
-        torque_along(build_servos(r)[0], d.u[..., 0], d.y[..., 0], d.u[..., 1:], 0.01)
-        for r, d in ((rig, data), (plain, bare))
-    )
-    np.testing.assert_allclose(one, two, rtol=1e-12)
-    assert identifiability(rig, system, build_servos(rig)) == ((), ())
-
-
 def test_a_declaration_is_written_and_stored_as_it_is(tmp_path):
     rig = _servo(tmp_path, SERVO + f"{KP}\n{LIMIT}")
     fit = begin(rig, read_logs(_log(tmp_path), rig).data, key=jax.random.key(0))
@@ -413,8 +373,6 @@ BAD_LOGS = {
         r"line 8, column 'gain': found -1; goal.kp is proportional to it: write 0",
     ),
     "millivolts": ({"supply": 7400.0}, r"column 'supply': at most 7400, where rig.toml declares goal.kp at 7.4; write"),
-    "text": ({"gain": "high", "at": 3}, r"line 5, column 'gain'"),
-    "no column": ({"names": "time,goal,gain,voltage,theta1"}, "'supply'"),
 }
 
 
@@ -424,12 +382,3 @@ def test_a_mistake_in_a_log_is_refused_with_row_and_column(tmp_path, wrong, mess
     with pytest.raises(DataError, match=message) as error:
         read_logs(_log(tmp_path, **wrong), rig)
     assert "a.csv" in str(error.value)
-
-
-@pytest.mark.parametrize("ratio", [OTHER_UNIT, 1 / OTHER_UNIT])
-def test_a_column_may_be_far_from_its_declared_value_but_not_in_another_unit(tmp_path, ratio):
-    """One percent to either side of the largest and the smallest ratio."""
-    rig, more = _servo(tmp_path, SERVO + KP), 1.01 if ratio > 1 else 1 / 1.01
-    assert read_logs(_log(tmp_path, supply=7.4 * ratio / more), rig).data.u.shape[-1] == 3
-    with pytest.raises(DataError, match="write both in one unit"):
-        read_logs(_log(tmp_path, supply=7.4 * ratio * more), rig)

@@ -5,18 +5,14 @@ import functools
 import importlib
 import math
 import os
-import signal
 import sys
-import threading
 import warnings
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from types import FrameType
-from typing import Any, TypeVar
+from typing import Any
 
 from .. import __version__
-from ..storage.log import Log, silent
+from ..storage.log import silent
 
 _MODULES = {"import": "import_logs"}
 """Modules that cannot be called like their command: `import` is a word of Python."""
@@ -36,6 +32,8 @@ examples:
 
 A data set is a folder with rig.toml, train/*.csv and, if there is one, test/*.csv.  SI units: s, N m, rad, rad/s.
 """
+COMMANDS = ("simulate", "init", "import", "check", "identify", "diagnose", "design", "compare", "predict", "smooth")
+COMMANDS += ("export",)
 SYSTEMS = ("acrobot", "pendubot", "pendulum", "slide")
 SMOOTHERS = {
     "cubature": "gaussian.CubatureSmoother",
@@ -47,106 +45,80 @@ SMOOTHERS = {
 
 def parser() -> argparse.ArgumentParser:
     """All commands with their options."""
-    top = _new(
-        argparse.ArgumentParser,
-        "Find which physical effect the model of a machine lacks, from its logs; identify friction, noise and numbers.",
-        _MAIN,
-        prog="nnap-em",
-    )
+    form: dict[str, Any] = {"formatter_class": argparse.RawDescriptionHelpFormatter, "allow_abbrev": False}
+    about = "Find which physical effect the model of a machine lacks, from its logs; identify friction, noise, numbers."
+    top = argparse.ArgumentParser(prog="nnap-em", description=about, epilog=_MAIN, **form)
     top.add_argument("--version", action="version", version=f"nnap-em {__version__}")
-    commands = top.add_subparsers(dest="command", metavar="COMMAND", required=True)
-
-    def command(name: str) -> argparse.ArgumentParser:
-        """The parser of a command, whose help is the docstring of its module, which is not imported for that."""
+    under = top.add_subparsers(dest="command", metavar="COMMAND", required=True)
+    commands: dict[str, argparse._ActionsContainer] = {}
+    for name in COMMANDS:  # the help of a command is the docstring of its module, which is not imported for that
         text = Path(__file__).with_name(f"{_MODULES.get(name, name)}.py").read_text()
         summary, _, examples = text.split('"""')[1].partition("\n\n")
         short = f"{summary[0].lower()}{summary[1:]}".rstrip(".")
-        return _new(commands.add_parser, summary, examples, name=name, help=short)
+        commands[name] = under.add_parser(name, help=short, description=summary, epilog=examples, **form)
+    commands["machine"] = commands["init"].add_mutually_exclusive_group()
 
-    simulate = command("simulate")
-    _file(simulate, "out", "OUT", "the new folder")
-    simulate.add_argument("--system", choices=SYSTEMS, default="acrobot", help="the machine (default: acrobot)")
-    simulate.add_argument("--sequences", type=_count, default=20, metavar="N", help="training sequences (20)")
-    simulate.add_argument("--test", type=_natural, default=5, metavar="N", help="test sequences (5)")
-    simulate.add_argument("--steps", type=_count, default=500, metavar="N", help="sample intervals of each (500)")
-    simulate.add_argument("--seed", type=_natural, default=0, help="of all random numbers (0)")
-    simulate.add_argument("--measured", nargs="+", metavar="STATE", help="which states are read")
-    for kind, what in (("process", "kick per step"), ("measurement", "readings")):
-        text = f"standard deviations: {what} of positions [rad or m] and of rates [rad/s or m/s]"
-        simulate.add_argument(f"--{kind}-noise", nargs=2, type=_positive, metavar=("POSITION", "RATE"), help=text)
-
-    init = command("init")
-    _file(init, "log", "LOG", "a CSV file with a header, MCAP, ROS bag or HDF5")
-    machine = init.add_mutually_exclusive_group()
-    machine.add_argument("--system", choices=SYSTEMS, help="the machine, where the columns do not determine it")
-    text = 'the machine as MJCF or URDF, which stays where it is, or "equations" to be written'
-    _file(machine, "--model", "FILE", text)
-    _file(init, "--out", "FOLDER", "for rig.toml (default: that of the log, above train/)")
+    def add(to: str, name: str, text: str, metavar: str | None = None, kind: Any = None, **more: Any) -> None:
+        """Add an argument to some commands: a path where it has the name of a value alone."""
+        more |= {"metavar": metavar} if metavar else {}
+        more |= {"type": kind or Path} if kind or metavar else {}
+        for command in to.split():
+            commands[command].add_argument(name, help=text, **more)
 
     several: dict[str, Any] = {"action": "append", "default": []}
-    importing = command("import")
-    _file(importing, "logs", "LOG", "MCAP, ROS bag, HDF5, CSV, Excel, Parquet or MAT", nargs="+")
-    _file(importing, "--rig", "RIG", "rig.toml; its [import] says what is where", required=True)
-    _file(importing, "--out", "FOLDER", "the new data set", required=True)
-    text = "last sequences kept for the test, or share (0.2)"
-    importing.add_argument("--test", type=_part, default=0.2, metavar="N", help=text)
-    text = "add seconds to the times of a topic"
-    importing.add_argument("--shift", type=_shift, metavar="TOPIC=S", help=text, **several)
-    importing.add_argument("--unwrap", metavar="COLUMN", help="take out the jumps of a counter", **several)
-
-    check = command("check")
-    identify = command("identify")
-    diagnose = command("diagnose")
-    for bench in (check, identify, diagnose):
-        _file(bench, "folder", "FOLDER", "the data set: rig.toml, train/, test/")
-    for fits in (identify, diagnose):
-        _file(fits, "--out", "OUT", "folder for the results", required=True)
-        _file(fits, "--more", "NEW", "a folder of further logs to train on", **several)
-        _file(fits, "--from", "FIT", "a fit of the machine to begin from", dest="start")
-    identify.add_argument("--smoother", choices=SMOOTHERS, default="cubature", help="the E-step (default: cubature)")
-    identify.add_argument("--particles", type=_count, metavar="N", help="for --smoother particle")
-    identify.add_argument("--epochs", type=_count, default=40, metavar="N", help="at most so many in all (40)")
-    text = "answer after about M minutes with what is found by then"
-    diagnose.add_argument("--minutes", type=_minutes, metavar="M", help=text)
-    _file(diagnose, "--logs", "FOLDER", "of that fit, where they were moved", **several)
-
-    design = command("design")
-    _file(design, "folder", "FIT", "model.npz or after.npz, or the folder that holds it")
-    _file(design, "--out", "OUT", "folder for the results", required=True)
-    design.add_argument("--for", metavar="QUESTION", default="all", help="what is to be learned (default: all)")
-    design.add_argument("--seconds", type=_time, default=60.0, metavar="S", help="of all sequences together (60)")
-    design.add_argument("--sequences", type=_count, default=6, metavar="N", help="how many (6)")
-    _file(design, "--logs", "FOLDER", "of the fit, where they were moved", **several)
-    for fits in (identify, diagnose, design):
-        fits.add_argument("--seed", type=_natural, default=0, help="of all random numbers (0)")
-        fits.add_argument("--quiet", action="store_true", help="no lines of progress")
-        fits.add_argument("--profile", action="store_true", help="print the seconds of stages and programs")
-
-    compare = command("compare")
-    _file(compare, "fits", "FIT", "model.npz, or the folder that holds it", nargs="+")
-    _file(compare, "--out", "OUT", "folder for the page and the numbers")
-
-    predict = command("predict")
-    smooth = command("smooth")
-    for use in (predict, smooth):
-        _file(use, "model", "MODEL", "model.npz, or the folder that holds it")
-        _file(use, "folder", "FOLDER", "the logs, such as bench/test")
-        _file(use, "--out", "DIR", "folder for the CSV files", required=True)
-    predict.add_argument("--given", type=_time, required=True, metavar="S", help="readings up to here are used [s]")
-    predict.add_argument("--seed", type=_natural, default=0, help="of the sample paths (0)")
-
+    flag: dict[str, Any] = {"action": "store_true"}
+    fits, model = "identify diagnose", "model.npz, or the folder that holds it"
+    add("simulate", "out", "the new folder", "OUT")
+    add("simulate", "--system", "the machine (default: acrobot)", choices=SYSTEMS, default="acrobot")
+    add("simulate", "--sequences", "training sequences (20)", "N", _count, default=20)
+    add("simulate", "--test", "test sequences (5)", "N", _natural, default=5)
+    add("simulate", "--steps", "sample intervals of each (500)", "N", _count, default=500)
+    add("simulate", "--measured", "which states are read", "STATE", str, nargs="+")
+    for option, what in (("process", "kick per step"), ("measurement", "readings")):
+        text = f"standard deviations: {what} of positions [rad or m] and of rates [rad/s or m/s]"
+        pair: Any = ("POSITION", "RATE")
+        add("simulate", f"--{option}-noise", text, pair, _positive, nargs=2)
+    add("init", "log", "a CSV file with a header, MCAP, ROS bag or HDF5", "LOG")
+    add("machine", "--system", "the machine, where the columns do not determine it", choices=SYSTEMS)
+    text = 'the machine as MJCF or URDF, which stays where it is, or "equations" to be written'
+    add("machine", "--model", text, "FILE")
+    add("init", "--out", "for rig.toml (default: that of the log, above train/)", "FOLDER")
+    add("import", "logs", "MCAP, ROS bag, HDF5, CSV, Excel, Parquet or MAT", "LOG", nargs="+")
+    add("import", "--rig", "rig.toml; its [import] says what is where", "RIG", required=True)
+    add("import", "--out", "the new data set", "FOLDER", required=True)
+    add("import", "--test", "last sequences kept for the test, or share (0.2)", "N", _part, default=0.2)
+    add("import", "--shift", "add seconds to the times of a topic", "TOPIC=S", _shift, **several)
+    add("import", "--unwrap", "take out the jumps of a counter", "COLUMN", str, **several)
+    add(f"check {fits}", "folder", "the data set: rig.toml, train/, test/", "FOLDER")
+    add("design", "folder", "model.npz or after.npz, or the folder that holds it", "FIT")
+    add(f"{fits} design", "--out", "folder for the results", "OUT", required=True)
+    add(fits, "--more", "a folder of further logs to train on", "NEW", **several)
+    add(fits, "--from", "a fit of the machine to begin from", "FIT", dest="start")
+    add("identify", "--smoother", "the E-step (default: cubature)", choices=SMOOTHERS, default="cubature")
+    add("identify", "--particles", "for --smoother particle", "N", _count)
+    add("identify", "--epochs", "at most so many in all (40)", "N", _count, default=40)
+    add("diagnose", "--minutes", "answer after about M minutes with what is found by then", "M", _minutes)
+    add("design", "--for", "what is to be learned (default: all)", "QUESTION", str, default="all")
+    add("design", "--seconds", "of all sequences together (60)", "S", _time, default=60.0)
+    add("design", "--sequences", "how many (6)", "N", _count, default=6)
+    add("diagnose design", "--logs", "of that fit, where they were moved", "FOLDER", **several)
+    add(f"{fits} design", "--quiet", "no lines of progress", **flag)
+    add(f"{fits} design", "--profile", "print the seconds of stages and programs", **flag)
+    add("compare", "fits", model, "FIT", nargs="+")
+    add("compare", "--out", "folder for the page and the numbers", "OUT")
+    add("predict smooth export", "model", model, "MODEL")
+    add("predict smooth", "folder", "the logs, such as bench/test", "FOLDER")
+    add("predict smooth", "--out", "folder for the CSV files", "DIR", required=True)
+    add("predict", "--given", "readings up to here are used [s]", "S", _time, required=True)
     text = "use spikes and what a stuck, late or saturated sensor reads"
-    for reads in (check, identify, diagnose, design, predict, smooth):
-        reads.add_argument("--trust-readings", action="store_true", help=text)
-
-    export = command("export")
-    _file(export, "model", "MODEL", "model.npz, or the folder that holds it")
-    _file(export, "--out", "OUT", "folder for the files")
-    _file(export, "--mjcf", "FILE", "write a machine that came from a file back as MJCF")
-    _file(export, "--urdf", "FILE", "write a machine that came from a URDF file back as URDF")
-    _file(export, "--c", "FILE", "friction and feed-forward torque as C99")
-    _file(export, "--observer", "FILE", "write an online estimator of the states as C99")
-    export.add_argument("--float", action="store_true", help="numbers of 32 bits in that estimator")
+    add(f"check {fits} design predict smooth", "--trust-readings", text, **flag)
+    add(f"simulate {fits} design predict", "--seed", "of all random numbers (0)", "SEED", _natural, default=0)
+    add("export", "--out", "folder for the files", "OUT")
+    add("export", "--mjcf", "write a machine that came from a file back as MJCF", "FILE")
+    add("export", "--urdf", "write a machine that came from a URDF file back as URDF", "FILE")
+    add("export", "--c", "friction and feed-forward torque as C99", "FILE")
+    add("export", "--observer", "write an online estimator of the states as C99", "FILE")
+    add("export", "--float", "numbers of 32 bits in that estimator", **flag)
     return top
 
 
@@ -173,14 +145,14 @@ def main(argv: Sequence[str] | None = None) -> int:
         from ..numerics.profile import profiling  # loads JAX
         from . import common
 
-        with warnings.catch_warnings(), _stoppable(silent if getattr(args, "quiet", False) else _log) as log:
+        with warnings.catch_warnings():
             warnings.showwarning = _warn  # pyrefly: ignore[bad-assignment]  (called by place)
             for kind in common.WARNINGS:
                 warnings.simplefilter("always", kind)
             common.set_up()
             run = importlib.import_module(f".{_MODULES.get(args.command, args.command)}", __package__).run
             with profiling(getattr(args, "profile", False)):
-                return run(args, log) or 0
+                return run(args, silent if getattr(args, "quiet", False) else _log) or 0
     except KeyboardInterrupt as stopped:
         _log(str(stopped) or "stopped; the files that were written are whole")
         return 130
@@ -190,31 +162,6 @@ def main(argv: Sequence[str] | None = None) -> int:
             raise
         _log(f"error: {line}")
         return 2
-
-
-@contextmanager
-def _stoppable(log: Log) -> Iterator[Log]:
-    """`log`, which ends a command that lost its Ctrl-C: exceptions raised in a garbage collection are dropped."""
-    interrupted = []
-
-    def handle(number: int, frame: FrameType | None) -> None:
-        interrupted.append(number)
-        raise KeyboardInterrupt
-
-    def line(text: str) -> None:
-        log(text)
-        if interrupted:
-            raise KeyboardInterrupt
-
-    ours = threading.current_thread() is threading.main_thread()
-    ours = ours and signal.getsignal(signal.SIGINT) is signal.default_int_handler  # not where it is ignored
-    if ours:
-        signal.signal(signal.SIGINT, handle)
-    try:
-        yield line
-    finally:
-        if ours:
-            signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def _line(error: Exception) -> str | None:
@@ -236,20 +183,7 @@ def _log(text: str) -> None:
     print(f"nnap-em: {text}", file=sys.stderr, flush=True)
 
 
-def _new(make: Callable[..., argparse.ArgumentParser], summary: str, examples: str, **options: str):
-    form = argparse.RawDescriptionHelpFormatter
-    return make(description=summary, epilog=examples, formatter_class=form, allow_abbrev=False, **options)
-
-
-def _file(command: argparse._ActionsContainer, name: str, metavar: str, text: str, **options: Any) -> None:
-    """Add the path of a file or folder to the arguments of a command."""
-    command.add_argument(name, metavar=metavar, type=Path, help=text, **options)
-
-
-_N = TypeVar("_N", int, float)
-
-
-def _number(text: str, kind: type[_N], low: int | float, form: str) -> _N:
+def _number(text: str, kind: Callable[[str], float], low: float, form: str) -> Any:
     try:
         if low <= (value := kind(text)) < math.inf:
             return value

@@ -3,7 +3,9 @@
 import math
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from functools import partial
+
+from .table import Table
 
 Range = tuple[float, float]
 
@@ -23,21 +25,17 @@ class Bounds:
 UNBOUNDED = Bounds()
 
 
-def read_bounds(table: Any, inputs: Collection[str], states: Collection[str]) -> Bounds:
-    """The table [limits] of a `rig.toml`: a number is a bound both ways, a pair the lowest and the highest.
-
-    Refused are unknown columns, pairs that are upside down, and a bound of 0.
-    """
-    table.check((), (*inputs, *states, "rate", "start"))
-    rate, start = table.table("rate", absent={}), table.table("start", absent={})
-    rate.check((), inputs)
-    start.check((), states)
-    values = {name: read_range(table, name) for name in table.items if name not in ("rate", "start")}
-    rates = {name: read_range(rate, name) for name in rate.items}
-    return Bounds(values, rates, {name: read_range(start, name, place=True) for name in start.items})
+def read_bounds(root: Table, inputs: Collection[str], states: Collection[str]) -> Bounds:
+    """The table [limits] of a `rig.toml`: a number is a bound both ways, a pair the lowest and the highest."""
+    limits = root.table("limits", absent={})
+    return Bounds(
+        root.each("limits", read_range, (*inputs, *states), apart=("rate", "start")),
+        limits.each("rate", read_range, inputs),
+        limits.each("start", partial(read_range, place=True), states),
+    )
 
 
-def read_range(table: Any, key: str, *, place: bool = False) -> Range:
+def read_range(table: Table, key: str, *, place: bool = False) -> Range:
     """A pair as it stands; a number is that far both ways, or the one `place`."""
     value = table.items[key]
     pair = value if isinstance(value, list) else [value, value] if place else [0.0, value]

@@ -1,7 +1,9 @@
 """Drives that rig.toml declares: an input is a torque, or the command of a servo with a law of its own."""
 
-from collections.abc import Collection, Mapping
-from typing import Any, NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+from .table import Declared, Table, nearest
 
 TORQUE = "torque"
 """The kind of a column that is the torque itself [N m, or N on a slide]."""
@@ -43,46 +45,110 @@ AT = "at"
 
 
 class Drive(NamedTuple):
-    """The kind of an input, and its numbers, of class `Declared`, by their keys."""
+    """The kind of an input, and its numbers by their keys."""
 
-    kind: str
-    numbers: Mapping[str, Any]
+    kind: str = TORQUE
+    numbers: Mapping[str, Declared] = {}
     scales: Mapping[str, Mapping[str, float]] = {}
     """Columns that a number is proportional to, by its key, each with the value at which it is as declared."""
 
 
-def read_drives(table: Any, columns: Collection[str], of_file: Mapping[str, Drive] | None = None) -> dict[str, Drive]:
-    """The drive of every column of the table [input]; `of_file` are those of a machine file.
+class Inputs(NamedTuple):
+    """The table [input]."""
 
-    Keys of [input] hold for every column that has such a number, those of [input.COLUMN] for one.
-    Refused are unknown kinds and keys, a servo without its gain, and numbers that no drive has.
+    columns: tuple[str, ...]
+    joints: tuple[int, ...]
+    """The joint that each drives, counted from 1."""
+    drives: Mapping[str, Drive] = {}
+    motored: bool = False
+    """True where they are the motors of a machine file."""
+
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """The kind of every column; nothing where all are torques."""
+        kinds = tuple(drive.kind for drive in self.drives.values())
+        return () if set(kinds) <= {TORQUE} else kinds
+
+    @property
+    def numbers(self) -> dict[str, Declared]:
+        """The numbers of all drives by the names that parameters have: the column, a dot, the key."""
+        return {f"{name}.{key}": value for name, drive in self.drives.items() for key, value in drive.numbers.items()}
+
+    @property
+    def scales(self) -> dict[str, dict[str, float]]:
+        """Columns that numbers are proportional to, by the names of the numbers."""
+        return {f"{name}.{key}": dict(at) for name, drive in self.drives.items() for key, at in drive.scales.items()}
+
+
+def read_inputs(
+    table: Table, states: Sequence[str], names: Sequence[str], motors: Mapping[str, tuple[int, Drive]] | None = None
+) -> Inputs:
+    """Columns of [input], the joint of each, counted from 1, by its name or number, and its drive.
+
+    `motors` are those of a machine file, which are the inputs where no joints are declared.  Keys of [input] hold for
+    every column that has such a number, those of [input.COLUMN] for one.
     """
-    _refuse_unknown(table, columns)
-    drives = {column: _drive(table, column, (of_file or {}).get(column, Drive(TORQUE, {}))) for column in columns}
+    motors = motors or {}
+    table.check((), (*RESERVED, *(key for key, value in table.items.items() if isinstance(value, dict))))
+    motored = bool(motors) and "joints" not in table.items
+    columns = table.distinct("columns", str) if "columns" in table.items or not motors else tuple(motors)
+    table.check((), (*RESERVED, *columns))
+    for column in columns:
+        if column in ("time", *states):
+            hint = "name torque columns only, or commands of servos; a motor by another name than its joint's"
+            table.refuse("columns", f"{column!r} is the time or a state, and no torque or command", hint)
+        if motored and column not in motors:
+            hint = f"{nearest(column, list(motors))}; or say which joints the columns drive: joints = [...]"
+            table.refuse("columns", f"{column!r} is no motor of the file", hint)
+    joints = [motors[column][0] for column in columns] if motored else _joints(table, names, len(columns))
+    for joint in joints:
+        if joints.count(joint) > 1:
+            twice = " and ".join(column for column, j in zip(columns, joints, strict=True) if j == joint)
+            hint = "let one of them drive it, and log their sum"
+            table.refuse("columns", f"{twice} drive one joint, {names[joint - 1]!r}", hint)
+    drives = {column: _drive(table, column, motors[column][1] if motored else Drive()) for column in columns}
     kinds = {drive.kind for drive in drives.values()}
     for key in table.items:
         if key in KEYS and not any(key in KINDS[kind] for kind in kinds):
             problem = f"no input has a {key} (kinds: {', '.join(sorted(kinds)) or 'none'})"
             table.refuse(key, problem, f"write {_LINE} beside it, or take it out")
-    return drives
+    out = Inputs(columns, tuple(joints), drives, motored)
+    for name, scale in out.scales.items():
+        if wrong := {"time", *states, *columns} & {*scale}:
+            problem = f"{AT}: {', '.join(map(repr, wrong))} is the time, a state or an input"
+            table.refuse(name, problem, "name a column that holds a gain or a supply")
+    return out
 
 
-def _drive(table: Any, column: str, of_file: Drive) -> Drive:
+def _joints(table: Table, names: Sequence[str], count: int) -> list[int]:
+    """Numbers of the joints that a table names."""
+    given = table.value("joints")
+    if not isinstance(given, list):
+        table.refuse("joints")
+    joints = [names.index(joint) + 1 if joint in names else joint for joint in given]
+    if len(joints) != count:
+        table.refuse("joints", f"found {len(joints)} joints for {count} columns")
+    if not all(type(joint) is int and 1 <= joint <= len(names) for joint in joints):
+        table.refuse("joints", None, f"write names of joints, or numbers from 1 to {len(names)}: {', '.join(names)}")
+    return joints
+
+
+def _drive(table: Table, column: str, of_file: Drive) -> Drive:
     """The drive of one column, by its own table, then by [input], then by the file."""
-    section = table.table("" if column in RESERVED else column, absent={})
+    section = table.table(column, absent={})
     section.check((), ("kind", *KEYS))
-    kind = _kind(section) or _kind(table) or of_file.kind
+    kinds = [place.choice("kind", KINDS) for place in (section, table) if "kind" in place.items]
+    kind = (*kinds, of_file.kind)[0]
     for key in section.items:
         if key != "kind" and key not in KINDS[kind]:
             keys = ", ".join(KINDS[kind])
             hint = f"possible are {keys}" if keys else f"write {_LINE} if it is the command of a servo"
             section.refuse(key, f"an input of kind {kind!r} has no {key}", hint)
     numbers, scales = dict(of_file.numbers) if of_file.kind == kind else {}, {}
-    for place in (table, section):
-        for key in KINDS[kind]:
-            if key in place.items:
-                numbers[key], scales[key] = _number(place, key, KINDS[kind][key]), _scale(place, key)
     for key, about in KINDS[kind].items():
+        for place in (table, section):
+            if key in place.items:
+                numbers[key], scales[key] = _number(place, key, about), _scale(place, key)
         if about.needed and key not in numbers:
             problem = f"missing: the input {column!r} of kind {kind!r} needs its {key}"
             hint = f"write {key} = {{ mean = 10.0, std = 5.0 }} [{about.unit}], or the number where it is known"
@@ -90,65 +156,27 @@ def _drive(table: Any, column: str, of_file: Drive) -> Drive:
     return Drive(kind, numbers, {key: scale for key, scale in scales.items() if scale})
 
 
-def keys(table: Any) -> tuple[str, ...]:
-    """Keys allowed in [input], tables of single columns among it, which `read_drives` looks at."""
-    return (*RESERVED, *(key for key, value in table.items.items() if isinstance(value, dict)))
-
-
-def _refuse_unknown(table: Any, columns: Collection[str]) -> None:
-    """A table of a column that is not there."""
-    for key, value in table.items.items():
-        if isinstance(value, dict) and key not in (*columns, *RESERVED):
-            problem = f"no input column is called {key!r}"
-            hint = "name it in columns and its joint in joints, or take the table out"
-            table.refuse(key, problem, f"{hint}; columns are {', '.join(columns) or 'none'}")
-
-
-def _kind(table: Any) -> str | None:
-    return table.choice("kind", KINDS) if "kind" in table.items else None
-
-
-def _number(table: Any, key: str, about: Key) -> Any:
+def _number(table: Table, key: str, about: Key) -> Declared:
     """A number that such a drive can have."""
     value = table.quantity(key, (AT,))
     if about.least is not None and (value.mean < about.least or (about.open and value.mean == about.least)):
         bound = f"a number above {about.least:g}" if about.open else f"{about.least:g} or more"
         table.refuse(key, f"found {value.mean:g}", f"write {bound} [{about.unit}]")
-    if key == "gain" and value.mean == 0:
-        table.refuse(key, "found 0", "write the torque of a unit of the command [N m]")
     return value
 
 
-def _scale(table: Any, key: str) -> dict[str, float]:
+def _scale(table: Table, key: str) -> dict[str, float]:
     """The columns that a number is proportional to, with their values at which it is as declared."""
     value = table.items[key]
     if not isinstance(value, dict) or AT not in value:
         return {}
     pair = table.table(key)
-    line = "at = { gain = 400.0 }: a column of the logs, and its value at which the number is as declared"
-    at = pair.table(AT) if isinstance(value[AT], dict) and value[AT] else pair.refuse(AT, None, f"write {line}")
     if key == "delay":
         pair.refuse(AT, "a delay is the same in all rows", "take it out")
-    for column in at.items:
-        if at.number(column) <= 0:
-            at.refuse(column, None, f"write the value of that column at which {key} is as declared, above 0")
-    return {column: at.number(column) for column in at.items}
-
-
-def scaled(drives: Mapping[str, Drive], reserved: Collection[str], table: Any) -> dict[str, dict[str, float]]:
-    """Columns that numbers are proportional to, by the names of the numbers; refused are `reserved` ones."""
-    scales = {f"{name}.{key}": dict(scale) for name, drive in drives.items() for key, scale in drive.scales.items()}
-    for name, scale in scales.items():
-        for column in scale:
-            if column in reserved:
-                hint = "name a column that holds a gain or a supply"
-                table.refuse(name, f"{AT}: {column!r} is the time, a state or an input", hint)
-    return scales
-
-
-def named(drives: Mapping[str, Drive]) -> dict[str, Any]:
-    """The numbers of all drives by the names that parameters have: the column, a dot, the key."""
-    return {f"{column}.{key}": value for column, drive in drives.items() for key, value in drive.numbers.items()}
+    if not isinstance(value[AT], dict) or not value[AT]:
+        line = "at = { gain = 400.0 }: a column of the logs, and its value at which the number is as declared"
+        pair.refuse(AT, None, f"write {line}")
+    return pair.each(AT, Table.positive, [*value[AT]])
 
 
 def key_of(name: str, kinds: Mapping[str, str]) -> Key | None:

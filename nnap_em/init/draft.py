@@ -11,7 +11,8 @@ from jaxtyping import Float
 from ..data.dataset import DataError
 from ..data.formats import header_hint
 from ..data.noise import reading_noise
-from ..data.rig import SystemSpec, toml_key, toml_text
+from ..data.rig import SystemSpec
+from ..data.table import toml_key, toml_text
 from ..data.units import named_unit, parameter_unit, si
 from ..import_.files import read, reader
 from ..import_.recording import UNTIMED, Address, Topic, last_word, places
@@ -146,11 +147,8 @@ def meanings(topics: Sequence[Topic]) -> list[tuple[Address, str, Meaning]]:
         for field in topic.fields:
             word = re.sub(r"\[(\d+)\]$", lambda place: str(int(place[1]) + 1), last_word(field))
             of = meaning(word)
-            if (
-                of.kind not in ("", "time")
-                and not re.match(r"(position|velocity|effort)\[", word)
-                and "stamp" not in field
-            ):
+            named = of.kind not in ("", "time") and "stamp" not in field
+            if named and not re.match(r"(position|velocity|effort)\[", word):
                 every.append((Address(topic.name, field, si(of.unit)[1] if of.unit else None), word, of))
     shift = {of.kind == "input" for _, _, of in every if of.number == 0}
 
@@ -193,11 +191,8 @@ def _system(path: Path, states: Iterable[str], inputs: Mapping[str, tuple], spec
         return "slide"
     if kinds & {"theta2", "dtheta2"} and not slides:
         return "pendubot" if [joint for _, joint in inputs.values()] == [1] else "acrobot"
-    reason = (
-        "theta1 may be of a pendulum or of an arm with a hidden joint" if angles else "no column is named as a state"
-    )
-    if slides:
-        reason = "a coordinate x and an angle are of no machine that is known by its columns"
+    reason = "theta1 may be of a pendulum, or of an arm with a hidden joint"
+    reason = reason if angles and not slides else "its columns are those of no machine here"
     raise DataError(f"{path}: {reason}; give --system {', '.join(sorted(specs))}")
 
 

@@ -7,7 +7,7 @@ from jaxtyping import Float
 
 from ..data.dataset import DataError
 from ..data.noise import reading_noise, resolution
-from ..data.rig import toml_text
+from ..data.table import toml_text
 from ..import_.files import reader
 from ..import_.recording import Address
 from .draft import HEAD, Draft, columns_table, meaning, sampling
@@ -39,7 +39,6 @@ def draft_equations(path: Path) -> Draft:
         "",
         "[measurement]",
         f"columns = {{ {', '.join(f'{toml_text(name)} = {toml_text(state)}' for name, state in names.items())} }}",
-        *_ranges({name: columns[name] for name in readings}),
         "",
         "[measurement.noise_std]    # read off the high frequencies; what is left out is estimated",
         *(f"# {toml_text(name)} = {reading_noise(columns[name][None]):.2g}" for name in readings),
@@ -57,14 +56,3 @@ def _input(name: str, values: Float[np.ndarray, " time"]) -> bool:
     still = float(np.mean(np.diff(values) == 0)) if len(values) > 1 else 0.0
     # Share of equal neighbours from which on a column is taken for an input: that of a reading changes in every row
     return meaning(name).kind == "input" or (still > 0.5 and resolution(values[None]) == 0.0)
-
-
-def _ranges(columns: dict[str, Float[np.ndarray, " time"]]) -> list[str]:
-    """Ends that some readings share, as a comment."""
-    out = {}
-    for name, values in columns.items():
-        low, high = float(np.nanmin(values)), float(np.nanmax(values))
-        if max(np.sum(values == low), np.sum(values == high)) > 3:
-            out[name] = [low, high]
-    text = ", ".join(f"{toml_text(name)} = {ends}" for name, ends in out.items())
-    return [f"# range = {{ {text} }}    # readings at the ends of a sensor's range are not read"] if out else []

@@ -7,8 +7,8 @@ from pathlib import Path
 
 from ..data.dataset import DataError
 from ..data.machine import SENSE_UNITS, Machine, machine_unit, packed, states
-from ..data.rig import toml_key, toml_text
 from ..data.servo import TORQUE
+from ..data.table import toml_key, toml_text
 from ..import_.files import reader
 from ..import_.recording import Address, Topic, places
 from ..machines.locked import Part
@@ -30,8 +30,10 @@ def draft_machine(path: Path, model: Path, home: Path) -> Draft:
         names = ", ".join(joint.name for joint in machine.joints)
         hint = "write rig.toml by hand, with [import.columns]"
         raise DataError(f"{path}: nothing in it is called as a joint of {model} ({names}); {hint}")
-    columns |= (sensed := sensors(machine, topics))
-    machine = machine._replace(sensors=tuple(sensor for sensor in machine.sensors if sensor.name in sensed))
+    fields = {at.path: at for at in (Address(topic.name, field) for topic in topics for field in topic.fields)}
+    sensed = tuple(one for one in machine.sensors if one.kind in SENSE_UNITS and one.name in fields)
+    columns |= {sensor.name: fields[sensor.name] for sensor in sensed}
+    machine = machine._replace(sensors=sensed)
     machine = machine._replace(states=states(machine, columns))
     text, driving = packed(machine), {name: (at, toml_text(joint)) for name, (at, joint) in inputs.items()}
     return drafted(
@@ -63,20 +65,6 @@ def _joints(machine: Machine, topics: Sequence[Topic]) -> dict[str, Address]:
                 out[sensor] = _first(fields, [sensor])
             elif at := at or kinds.get(f"{kind}{i + 1}"):
                 out[d + joint.name] = at
-    return out
-
-
-def sensors(machine: Machine, topics: Sequence[Topic]) -> dict[str, Address]:
-    """Components of other sensors, and where they are: by name, or as ROS calls those of the only one of its kind."""
-    every, out = [Address(topic.name, field) for topic in topics for field in topic.fields], {}
-    # Names of readings in a ROS message of an inertial sensor
-    imu = {"gyro": "angular_velocity", "accelerometer": "linear_acceleration"}
-    for sensor in machine.sensors:
-        alone = sum(other.kind == sensor.kind for other in machine.sensors) == 3
-        usual = f"{imu[sensor.kind]}.{'xyz'[sensor.axis]}" if alone and sensor.kind in imu else sensor.name
-        at = [at for at in every if at.path == sensor.name] or [at for at in every if at.path == usual]
-        if sensor.kind in SENSE_UNITS and len(at) == 1:
-            out[sensor.name] = at[0]
     return out
 
 
@@ -115,10 +103,7 @@ def _model(machine: Machine, file: str, held: Mapping[str, float]) -> Iterator[s
         values = ", ".join(f"{toml_text(name)} = {value:g}" for name, value in held.items())
         yield f"locked = {{ {values} }}    # rad or m; held, as they move no mass or follow another"
     yield 'friction = "unknown"    # learned in every joint; "none": damping and frictionloss of the file'
-    yield from (
-        "",
-        "[model.uncertain]    # what of the file is not trusted: take the # of a line away, and say how far",
-    )
+    yield from ("", "[model.uncertain]    # what of the file is not trusted: take the # away, and say how far")
     for body in machine.bodies:
         if body.mass > 0:
             key = toml_key(f"{body.name}.mass")
@@ -132,19 +117,11 @@ def _model(machine: Machine, file: str, held: Mapping[str, float]) -> Iterator[s
 
 def _driven(machine: Machine, joints: Mapping[str, str]) -> Iterator[str]:
     """The inputs; no lines where they are the motors of the file."""
-    if machine.motors and len(joints) == len(machine.motors):
-        yield from ("", f"# [input] is left out: the inputs are the motors of the file, {', '.join(joints)}.")
-        yield from _servos(machine)
+    if not machine.motors or len(joints) != len(machine.motors):
+        yield from driven(joints, joints=not machine.motors)
         return
-    yield from driven(joints, joints=not machine.motors)
-
-
-def _servos(machine: Machine) -> Iterator[str]:
-    """Lines with the numbers of servos of the file that may be uncertain."""
+    yield from ("", f"# [input] is left out: the inputs are the motors of the file, {', '.join(joints)}.")
     for motor in machine.motors:
-        if motor.kind == TORQUE:
-            continue
-        numbers = ", ".join(f"{key} = {value:.4g}" for key, value in motor.numbers if value)
-        yield f"# [input.{toml_text(motor.name)}]    # the goal of a {motor.kind} servo; in the file {numbers}"
-        yield from (f"# {key} = {{ mean = {x:.4g}, std = {0.2 * abs(x):.2g} }}" for key, x in motor.numbers if x)
-        yield "# delay = { mean = 0.01, std = 0.01 }    # s"
+        if motor.kind != TORQUE:
+            yield f"# [input.{toml_text(motor.name)}]    # the goal of a {motor.kind} servo; its numbers are the file's"
+            yield from (f"# {key} = {{ mean = {x:.4g}, std = {0.2 * abs(x):.2g} }}" for key, x in motor.numbers if x)

@@ -1,62 +1,65 @@
 """Declaration in rig.toml of a machine from a file: names, inputs, and uncertain numbers."""
 
 import warnings
-from collections.abc import Iterator
+from collections.abc import Collection
 from functools import partial
-from typing import Any
 
 import numpy as np
 
 from ..data.machine import OF_BODY, PAIRS, SENSE_UNITS, Machine, Motor, Sensor, of_body, packed, states
-from ..data.rig import Declaration, Declared, RigWarning, SystemSpec, every, kinds_of, nearest, read_columns
-from ..data.servo import TORQUE, Drive, read_drives, scaled
-from ..data.servo import named as drive_numbers
+from ..data.rig import Declaration, RigWarning, SystemSpec, every, nearest
+from ..data.servo import TORQUE, Drive, read_inputs
+from ..data.table import Declared, Table
 from .mjcf import Part, read_file
 from .spec import uncommented
 
 OF_JOINT = ("armature", "stiffness")
 
 
-def declare(root: Any) -> Declaration:
+def declare(root: Table) -> Declaration:
     """The machine of `[model] file`, and what is uncertain about it; `root` is the whole of rig.toml."""
     model = root.table("model")
     model.check(("type", "friction"), ("file", "uncertain", "joints", "locked"))
-    line = 'file = "arm.xml" (MJCF or URDF, beside rig.toml)'
-    if not isinstance(model.items.get("file"), str) or not model.items["file"]:
+    name = model.items.get("file")
+    if not isinstance(name, str) or not name:
+        line = 'file = "arm.xml" (MJCF or URDF, beside rig.toml)'
         model.refuse("file", None if "file" in model.items else "missing", f"write {line}")
-    part = _part(model)
-    path = root.path.parent / str(model.items["file"])
+    part, path = _part(model), root.path.parent / str(name)
     machine, file = read_file(path, part)
-    text = path.read_text(encoding="utf-8", errors="replace")
-    possible = tuple(sensor.name for sensor in machine.sensors if sensor.kind in SENSE_UNITS)
+    measurement = root.table("measurement")
+    columns = measurement.items.get("columns")
+    columns = columns if isinstance(columns, list) else []
+    rubs, names = model.items.get("friction") == "none", states(machine, columns)
+    if twice := [state for state in names if names.count(state) > 1]:
+        measurement.refuse("columns", f"{twice[0]!r} names two states", "rename the sensor in the file")
+    left_out = [joint.name for joint in machine.joints if joint.damping or joint.dry]
+    if left_out and not rubs:
+        problem = f"damping and frictionloss of {', '.join(left_out)} are left out, as friction is learned"
+        warnings.warn(f'{root.path}: {name}: {problem}; friction = "none" takes the file\'s', RigWarning, 2)
+    if not machine.motors and "input" not in root.items:
+        hint = "write the torque columns and their joints, or columns = [] and joints = [] where nothing drives it"
+        root.refuse("input", f"{name} has no actuator", hint)
+    motors = {motor.name: motor for motor in machine.motors}
+    drives = {
+        motor.name: (motor.joint + 1, Drive(motor.kind, {key: Declared(x, 0.0) for key, x in motor.numbers}))
+        for motor in machine.motors
+    }
+    inputs = read_inputs(root.table("input", absent={}), names, [joint.name for joint in machine.joints], drives)
+    parameters = _parameters(machine, model)
+    gears = [_gear(motors.get(column) if inputs.motored else None, drive) for column, drive in inputs.drives.items()]
+    text = path.read_text(encoding="utf-8", errors="replace") if "<robot" in uncommented(path) else ""
+    seen = tuple(sensor.name for sensor in machine.sensors if sensor.kind in SENSE_UNITS)
     machine = machine._replace(
-        file=str(model.items["file"]),
-        states=_states(machine, root),
-        rubs=model.items.get("friction") == "none",
-        sensors=tuple(_sensors(machine, root)),
+        file=str(name),
+        states=names,
+        rubs=rubs,
+        sensors=_sensors(machine, measurement, columns),
         part=None if part.whole else (part.joints, tuple(part.locked.items())),
+        gears=tuple(gears),
+        motored=inputs.motored,
     )
-    _warn_of_left_out(root, machine)
-    columns, joints, motored = _inputs(machine, root)
-    motors = {motor.name: motor for motor in machine.motors} if motored else {}
-    file_drives = {name: Drive(one.kind, {k: Declared(x, 0.0) for k, x in one.numbers}) for name, one in motors.items()}
-    drives = read_drives(root.table("input", absent={}), columns, file_drives)
-    gears = tuple(_gear(motors.get(column), drives[column]) for column in columns)
-    spec = SystemSpec(machine.states, (), {}, len(machine.joints), sensors=possible)
-    parameters = _parameters(machine, model) | drive_numbers(drives)
-    machine = packed(machine._replace(gears=gears, motored=motored))
-    scales = scaled(drives, ("time", *spec.states, *columns), root.table("input", absent={}))
-    return Declaration(
-        spec,
-        parameters,
-        columns,
-        joints,
-        machine,
-        kinds_of(drives),
-        scales,
-        file=file,
-        urdf=text if "<robot" in uncommented(path) else "",
-    )
+    spec = SystemSpec(names, (), {}, len(machine.joints), sensors=seen)
+    return Declaration(spec, parameters, inputs, packed(machine), file=file, urdf=text)
 
 
 def _gear(motor: Motor | None, drive: Drive) -> float:
@@ -64,7 +67,7 @@ def _gear(motor: Motor | None, drive: Drive) -> float:
     return 1.0 if motor is None or (drive.kind != TORQUE and motor.kind != drive.kind) else motor.gear
 
 
-def _part(model: Any) -> Part:
+def _part(model: Table) -> Part:
     """The joints of `[model] joints`, and the values of `[model] locked`."""
     joints = model.items.get("joints")
     if joints is not None:
@@ -72,78 +75,41 @@ def _part(model: Any) -> Part:
             model.refuse("joints", hint='write the names of the joints that move, joints = ["joint1", "joint2"]')
         joints = tuple(dict.fromkeys(joints))
     locked = model.table("locked", absent={})
-    for name in locked.items:
-        locked.number(name)
-        if joints and name in joints:
-            locked.refuse(name, "it is among the joints that move", "take it out of one of the two")
+    if both := [name for name in joints or () if name in locked.items]:
+        locked.refuse(both[0], "it is among the joints that move", "take it out of one of the two")
     return Part(joints, {name: locked.number(name) for name in locked.items})
 
 
-def _warn_of_left_out(root: Any, machine: Machine) -> None:
-    """Friction of the file has no part where it is learned."""
-    names = [joint.name for joint in machine.joints if joint.damping or joint.dry]
-    if names and not machine.rubs:
-        problem = f"damping and frictionloss of {', '.join(names)} are left out, as friction is learned"
-        warnings.warn(f'{root.path}: {machine.file}: {problem}; friction = "none" takes the file\'s', RigWarning, 2)
-
-
-def _states(machine: Machine, root: Any) -> tuple[str, ...]:
-    """Every joint by its name, or by that of the sensor whose column is measured."""
-    columns = root.table("measurement").items.get("columns")
-    names = states(machine, columns if isinstance(columns, list) else ())
-    for name in names:
-        if names.count(name) > 1:
-            root.table("measurement").refuse("columns", f"{name!r} names two states", "rename the sensor in the file")
-    return names
-
-
-def _sensors(machine: Machine, root: Any) -> Iterator[Sensor]:
+def _sensors(machine: Machine, table: Table, columns: Collection[str]) -> tuple[Sensor, ...]:
     """The components of sensors that are measured."""
-    table = root.table("measurement")
-    columns = table.items.get("columns")
-    for column in columns if isinstance(columns, list) else ():
+    for column in columns:
         for sensor in machine.sensors:
-            if sensor.name.rpartition(".")[0] not in (column, str(column).rpartition(".")[0]):
-                continue
-            if sensor.kind not in SENSE_UNITS:
+            own = sensor.name.rpartition(".")[0] in (column, str(column).rpartition(".")[0])
+            if own and sensor.kind not in SENSE_UNITS:
                 hint = f"read are joints, and {', '.join(SENSE_UNITS)} of a site: take the column out"
                 table.refuse("columns", f"{column!r} is of a sensor of type {sensor.kind}", hint)
-            if sensor.name == column:
-                yield sensor
+    return tuple(sensor for column in columns for sensor in machine.sensors if sensor.name == column)
 
 
-def _inputs(machine: Machine, root: Any) -> tuple[tuple[str, ...], tuple[int, ...], bool]:
-    """Columns, the joint that each drives, counted from 1, and whether they are the motors of the file."""
-    if not machine.motors and "input" not in root.items:
-        problem = f"{machine.file} has no actuator"
-        hint = "write the torque columns and their joints, or columns = [] and joints = [] where nothing drives it"
-        root.refuse("input", problem, hint)
-    names, motors = [joint.name for joint in machine.joints], {one.name: one.joint + 1 for one in machine.motors}
-    return read_columns(root.table("input", absent={}), machine.states, names, motors)
-
-
-def _parameters(machine: Machine, model: Any) -> dict[str, Declared]:
+def _parameters(machine: Machine, model: Table) -> dict[str, Declared]:
     """Every number of [model.uncertain], its mean that of the file where none is written."""
     table = model.table("uncertain", absent={}).flattened()
     bodies = {body.name: dict(zip(OF_BODY, of_body(body), strict=True)) for body in machine.bodies}
-    means = {f"{body}.{what}": value for body, values in bodies.items() for what, value in values.items()}
-    means |= {f"{joint.name}.{what}": float(getattr(joint, what)) for joint in machine.joints for what in OF_JOINT}
-    owners = [one.name for one in (*machine.bodies, *machine.joints)]
+    owners = {joint.name: {what: float(getattr(joint, what)) for what in OF_JOINT} for joint in machine.joints}
+    owners |= {name: owners.get(name, {}) | numbers for name, numbers in bodies.items()}
 
     def declared(name: str) -> Declared:
         owner, _, quantity = name.partition(".")
         if owner not in owners:
             table.refuse(name, f"no body or joint of {machine.file} is called {owner!r}", nearest(owner, owners))
-        if name not in means:
-            known = [key.partition(".")[2] for key in means if key.partition(".")[0] == owner]
-            problem = f"{owner!r} has no {quantity!r}" if quantity else "names no number"
-            table.refuse(name, problem, nearest(quantity, known))
-        value = table.quantity(name, mean=means[name])
+        if quantity not in owners[owner]:
+            table.refuse(name, f"{owner!r} has no {quantity!r}", nearest(quantity, owners[owner]))
+        value = table.quantity(name, mean=owners[owner][quantity])
         if (value.mean < 0 and quantity in ("mass", *OF_JOINT)) or (quantity == "mass" and not value.mean):
             table.refuse(name, f"found mean = {value.mean:g}", "write a number above 0")
         return value
 
-    out = every(**{name: partial(declared, name) for name in table.items})
+    out = every({name: partial(declared, name) for name in table.items})
     for body, values in bodies.items():
         own = {what: out[f"{body}.{what}"].mean for what in OF_BODY if f"{body}.{what}" in out}
         if own:
@@ -151,7 +117,7 @@ def _parameters(machine: Machine, model: Any) -> dict[str, Declared]:
     return out
 
 
-def _check_inertia(table: Any, body: str, values: dict[str, float]) -> None:
+def _check_inertia(table: Table, body: str, values: dict[str, float]) -> None:
     """Raise RigError unless some distribution of mass has the declared inertia."""
     inertia = np.empty((3, 3))
     for (i, j), what in zip(PAIRS, OF_BODY[4:], strict=True):

@@ -1,7 +1,6 @@
 """A machine from MJCF or URDF: MuJoCo's compiler reads the file, what the physics here has no place for is refused."""
 
 import re
-import warnings
 from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -9,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..data.machine import SENSE_UNITS, Body, Joint, JointSensor, Machine, Motor, Rotation, Sensor, Site, Vector
-from ..data.rig import RigWarning, nearest
+from ..data.rig import nearest
 from ..data.servo import TORQUE
 from .locked import Part, hold, holding
 from .spec import NOTHING, compiled, mujoco, opened, refuse, weightless, written
@@ -84,9 +83,13 @@ def _machine(path: Path, model: Any) -> Machine:
 
 
 def _hold(path: Path, spec: Any, part: Part) -> None:
-    """Free `spec` of the joints that are held; warns of bodies without mass that join another."""
+    """Free `spec` of the joints that are held."""
     model = weightless(path, spec)
-    _refuse_unknown(path, model, part)
+    names = [model.joint(j).name for j in range(model.njnt)]
+    for key, declared in (("joints", part.joints or ()), ("locked", part.locked)):
+        for name in declared:
+            if name not in names:
+                refuse(path, f"[model] {key} names {name!r}, which is no joint of it", nearest(name, names))
     _refuse_all(path, model, part)
     single = [j for j in range(model.njnt) if _kind("mjtJoint", model.jnt_type[j]) in ("slide", "hinge")]
     zeros = {model.joint(j).name: float(model.qpos0[model.jnt_qposadr[j]]) for j in single}
@@ -96,24 +99,7 @@ def _hold(path: Path, spec: Any, part: Part) -> None:
         for name, (leader, law) in follows.items():
             if name in values and leader in values and name not in part.locked:
                 values[name] = law(values[leader])
-    for name in values:
-        body = model.body(int(model.joint(name).bodyid[0]))
-        if body.mass[0] <= NOTHING or np.sum(body.inertia) <= 10 * NOTHING:
-            problem = f"body {body.name!r} hangs on the locked joint {name!r} and has no mass or no inertia"
-            warnings.warn(f"{path}: {problem}; it is joined to the body that carries it", RigWarning, 2)
     hold(spec, model, part, values)
-
-
-def _refuse_unknown(path: Path, model: Any, part: Part) -> None:
-    """Joints of rig.toml that the file does not have."""
-    names = [model.joint(j).name for j in range(model.njnt)]
-    for key, declared in (("joints", part.joints or ()), ("locked", part.locked)):
-        for name in declared:
-            if name not in names:
-                refuse(path, f"[model] {key} names {name!r}, which is no joint of it", nearest(name, names))
-    for j, name in enumerate(names):
-        if name in part.locked and _kind("mjtJoint", model.jnt_type[j]) not in ("slide", "hinge"):
-            refuse(path, f"joint {name!r} is held by more than one number", "name the joints that move: joints = [...]")
 
 
 def _kind(of: str, value: Any) -> str:
@@ -138,42 +124,39 @@ def _couplings(model: Any) -> dict[str, tuple[str, Callable[[float], float]]]:
 
 
 def _refuse_all(path: Path, model: Any, part: Part) -> None:
-    for problem, hint in _obstacles(model, part):
-        refuse(path, problem, hint)
-
-
-def _obstacles(model: Any, part: Part) -> Iterator[tuple[str, str]]:
-    """Obstacles by name, each with its remedy."""
+    """Raise MachineError at the first obstacle, with its remedy."""
     held = {j for j in range(model.njnt) if part.holds(model.joint(j).name)}
     for j in sorted({*range(model.njnt)} - held):
         name, kind = model.joint(j).name or f"number {j + 1}", _kind("mjtJoint", model.jnt_type[j])
         if kind == "free":
-            yield f"joint {name!r} is free", "the base is fixed here: take the free joint out"
+            refuse(path, f"joint {name!r} is free", "the base is fixed here: take the free joint out")
         if kind == "ball":
-            yield f"joint {name!r} is a ball joint", "write it as three hinges of one body"
+            refuse(path, f"joint {name!r} is a ball joint", "write it as three hinges of one body")
         if np.any(model.jnt_stiffnesspoly[j]) or np.any(model.jnt_springyield[j]):
-            yield f"the spring of joint {name!r} is not linear", "leave the linear part; diagnose finds what is missing"
-    if model.njnt == 0:
-        yield "nothing moves: it has no joint", "give the bodies hinges or slides"
-    elif len(held) == model.njnt:
-        yield "nothing moves: every joint is held", "leave some out of [model] locked, or name them in joints = [...]"
+            hint = "leave the linear part; diagnose finds what is missing"
+            refuse(path, f"the spring of joint {name!r} is not linear", hint)
+    if len(held) == model.njnt:
+        refuse(path, "nothing moves: it has no joint, or all are held", "give it hinges or slides; hold fewer of them")
     if closed := list(_closed(model, held)):
         lines = [model.joint(j).name for j in dict.fromkeys(j for joints in closed for j in sorted(joints))]
         hint = "a loop or coupling is no tree: take <equality> or <mimic> out"
         hint += f", or hold the joints that it closes: {holding(*lines)}" if lines else ""
-        yield f"it has {len(closed)} equality constraints" + ("" if part.whole else " on joints that move"), hint
-    if loose := sum(not _still(model, i, held) for i in range(model.ntendon)):
-        yield f"it has {loose} tendons", "put their springs and motors on joints, and take <tendon> out"
+        where = "" if part.whole else " on joints that move"
+        refuse(path, f"it has {len(closed)} equality constraints{where}", hint)
     for i in range(model.nactuator):
         if _moves(model, i, held):
-            yield from _actuator(model, i)
-    if model.opt.density or model.opt.viscosity:
-        yield "bodies move in a fluid", "set density and viscosity to 0; diagnose finds drag"
-    if np.any(model.body_gravcomp):
-        name = model.body(int(np.flatnonzero(model.body_gravcomp)[0])).name
-        yield f"body {name!r} has gravcomp", "log the torque that compensates its weight as an input, and take it out"
-    if model.nflex:
-        yield "it has flexible bodies", "bodies are rigid here: take them out"
+            _check_actuator(path, model, i)
+    for there, (problem, hint) in (
+        (
+            not all(_still(model, i, held) for i in range(model.ntendon)),
+            ("tendons", "put their springs and motors on joints, and take <tendon> out"),
+        ),
+        (model.opt.density or model.opt.viscosity, ("a fluid", "set density and viscosity to 0; diagnose finds drag")),
+        (np.any(model.body_gravcomp), ("gravcomp", "log the torque that compensates weights as an input, take it out")),
+        (model.nflex, ("flexible bodies", "bodies are rigid here: take them out")),
+    ):
+        if there:
+            refuse(path, f"it has {problem}", hint)
 
 
 def _closed(model: Any, held: set[int]) -> Iterator[set[int]]:
@@ -216,45 +199,35 @@ def _moves(model: Any, actuator: int, held: set[int]) -> bool:
 _JOINTS = ("joint", "jointinparent")
 
 
-def _actuator(model: Any, i: int) -> Iterator[tuple[str, str]]:
+def _check_actuator(path: Path, model: Any, i: int) -> None:
+    """Raise MachineError unless an actuator is a motor or a servo of a joint."""
     name = model.actuator(i).name or f"number {i + 1}"
     parts = ("mjtGain", "gain"), ("mjtBias", "bias"), ("mjtDyn", "dyn"), ("mjtTrn", "trn")
     gain, bias, state, acts = (_kind(of, getattr(model, f"actuator_{part}type")[i]) for of, part in parts)
     hint = "log the torque that it gives and make it <motor>, or take it out and name columns and joints in [input]"
-    if "muscle" in (gain, state):
-        yield f"actuator {name!r} is a muscle", hint
-    elif state != "none":
-        lag = "take the lag out of it (timeconst, dyntype): the fit can find one, as actuator_lag"
+    if state != "none" and gain != "muscle":
+        hint = "take the lag out of it (timeconst, dyntype): the fit can find one, as actuator_lag"
         goal = "log the goal that it has integrated and make it <position>"
-        yield f"actuator {name!r} has a state of its own", goal if state == "integrator" else lag
-    elif bias not in ("none", "affine"):
-        yield f"actuator {name!r} has a bias that is not affine", hint
-    elif gain not in ("fixed", "affine"):
-        yield f"actuator {name!r} has a gain that is neither fixed nor affine", hint
-    elif (drive := _drive(model, i)) is None:
-        hint = "write kind, gain, kp and kd of it in [input], and make it <motor>; or log its torque"
-        yield f"the gain of actuator {name!r} changes with position, or with rate beside another part", hint
-    elif drive[0] != TORQUE and (limits := _limits(model, i)) and not np.isclose(-limits[0], limits[1]):
+        refuse(path, f"actuator {name!r} has a state of its own", goal if state == "integrator" else hint)
+    plain = gain in ("fixed", "affine") and bias in ("none", "affine")
+    if not plain or (drive := _drive(model, i)) is None:
+        refuse(path, f"actuator {name!r} is no motor, servo or damper (gain: {gain}, bias: {bias})", hint)
+    if drive[0] != TORQUE and (limits := _limits(model, i)) and not np.isclose(-limits[0], limits[1]):
         hint = "make it symmetric about 0, or declare the limit in [input]: kind, its gains and limit = ..."
-        yield f"the torque of actuator {name!r} is limited to {limits[0]:g} ... {limits[1]:g}", hint
-    elif acts not in _JOINTS:
-        yield f"actuator {name!r} drives no joint", "let every motor drive a joint"
+        refuse(path, f"the torque of actuator {name!r} is limited to {limits[0]:g} ... {limits[1]:g}", hint)
+    if acts not in _JOINTS:
+        refuse(path, f"actuator {name!r} drives no joint", "let every motor drive a joint")
 
 
 def _refuse_names(path: Path, machine: Machine) -> None:
     """Names become columns, keys of rig.toml and file names: letters, digits, _ and -, none twice, none reserved."""
-    for joint in machine.joints:
-        if not joint.name:
-            body = machine.bodies[joint.body].name
-            refuse(path, f"a joint of body {body!r} has no name", "name it: that is what its coordinate is called")
-        if not re.fullmatch(r"[^\W\d][\w-]*", joint.name):
-            refuse(path, f"joint {joint.name!r}: unusable name", "write letters, digits, _ and -, a letter first")
-    names = [joint.name for joint in machine.joints]
-    for name in names:
+    names, reserved = [joint.name for joint in machine.joints], ("time", "u", "all", "type", "file")
+    for name, joint in zip(names, machine.joints, strict=True):
+        if not re.fullmatch(r"[^\W\d][\w-]*", name) or name in reserved:
+            problem = f"joint {name!r} of body {machine.bodies[joint.body].name!r}: unusable name"
+            refuse(path, problem, f"write letters, digits, _ and -, a letter first; not {', '.join(reserved)}")
         if f"d{name}" in names:
             refuse(path, f"joint {'d' + name!r} is called as the rate of joint {name!r}", "rename one of the two")
-        if name in ("time", "u", "all", "type", "file"):
-            refuse(path, f"joint {name!r} has a name that logs and rig.toml use", "rename it")
 
 
 # --- plain numbers

@@ -39,9 +39,7 @@ def mujoco() -> Any:
 def opened(path: Path) -> Any:
     """The content of an MJCF or URDF file as an MjSpec; a link of a URDF file without an inertial weighs nothing.
 
-    Warns of what MuJoCo warns of, and of rotors, which it does not read.
-
-    Raises MachineError at macros that are not expanded, and at what MuJoCo's parser refuses.
+    Warns of what MuJoCo warns of.  Raises MachineError at macros that are not expanded, and at what its parser refuses.
     """
     parser, heard, text = mujoco(), [], uncommented(path)
     unread = r"(?s)<(visual|collision|gazebo|ros2_control)\b.*?</\1>"  # of which no number is read
@@ -60,11 +58,6 @@ def opened(path: Path) -> Any:
     for line in heard:
         if "equal lower and upper limits" not in line:  # a limit without room is none
             warnings.warn(f"{path}: {line}", RigWarning, 2)
-    for block in re.finditer(r"(?s)<transmission\b.*?</transmission>", text):
-        if re.search(r"<\w*inertia", block[0], re.IGNORECASE):
-            where = f"{path}: line {text.count(chr(10), 0, block.start()) + 1}"
-            hint = "write its inertia times the reduction squared as JOINT.armature in [model.uncertain]"
-            warnings.warn(f"{where}: the rotor of a <transmission> is not read; {hint}", RigWarning, 2)
     for body in [body for body in spec.bodies[1:] if "<robot" in text and not body.explicitinertial]:
         body.explicitinertial, body.ipos = True, [0.0, 0.0, 0.0]
     return spec

@@ -229,7 +229,15 @@ def _one_joint(
     """A machine with one joint, at rest on average, whose position is read."""
     start = Gaussian(jnp.zeros(2), jnp.diag(jnp.asarray(spread) ** 2))
     law, log_q = StribeckLaw(*(jnp.asarray([value]) for value in friction)), 2 * jnp.log(jnp.asarray(q_std))
-    return StateSpaceModel(system, law, start, log_q, 2 * jnp.log(jnp.asarray([r_std])), (0,), 0.01)
+    return StateSpaceModel(
+        system=system,
+        unknown=law,
+        start=start,
+        log_q=log_q,
+        log_r=2 * jnp.log(jnp.asarray([r_std])),
+        measured=(0,),
+        dt=0.01,
+    )
 
 
 def _pendulum() -> Example:

@@ -37,7 +37,6 @@ class AbstractSystem(AbstractPlant):
         return cls(**{n: parameters[n] if n in parameters else left[n] for n in names}, joints=joints)
 
     def with_parameters(self, values: Mapping[str, Array]) -> "AbstractSystem":
-        """The machine with other values of some parameters."""
         return dataclasses.replace(self, **values)
 
     @property
@@ -55,7 +54,6 @@ class AbstractSystem(AbstractPlant):
         return f"{type(self).__name__}: {quantities(values)}; driven joints: {driven}"
 
     def unit(self, name: str) -> str:
-        """SI unit of a coordinate, rate or sensor."""
         if name in self.sensors:
             return self.sensors[name]
         place, dof = self.states.index(name), len(self.coordinates)
@@ -66,38 +64,30 @@ class AbstractSystem(AbstractPlant):
         return force_unit(self.angles[joint - 1])
 
     def port_unit(self, port: int) -> str:
-        """`force_unit`."""
         return self.force_unit(port)
 
     def input_of(self, joint: int | None, channel: str | None) -> int | None:
-        """Index of the input that drives a joint; channels are readings."""
         return self.joints.index(joint) if joint in self.joints else None
 
     def split(self, x: Float[Array, " state"]) -> tuple[Float[Array, " dof"], Float[Array, " dof"]]:
-        """Coordinates and rates."""
         dof = len(self.coordinates)
         return x[:dof], x[dof : 2 * dof]
 
     def mobility(self) -> Float[np.ndarray, " dof"]:
-        """Largest acceleration of every joint by a unit of its own torque, over poses."""
         q = jnp.asarray(np.random.default_rng(0).uniform(-np.pi, np.pi, (32, len(self.coordinates))), float)
         return np.max(np.asarray(_mobility(self, q)), axis=0)
 
     def push_of(self, q: Float[Array, " dof"], change: Float[Array, "node dof"]) -> Float[Array, "node dof"]:
-        """Impulse M(q) dv [N m s, or N s]."""
         return change @ self.mass(q).T
 
     @property
     def drives(self) -> list[dict[str, Any]]:
-        """The driven joints."""
         return [{"joint": joint} for joint in self.joints]
 
     def late(self, law, u):
-        """The law itself."""
         return law(u)
 
     def at_ports(self, torque: Float[Array, " dof"]) -> Float[Array, " dof"]:
-        """The torques themselves."""
         return torque
 
     @abstractmethod
@@ -124,13 +114,11 @@ class AbstractSystem(AbstractPlant):
     def slopes(
         self, q: Float[Array, " dof"], v: Float[Array, " dof"], u: Float[Array, " input"], push: Float[Array, " dof"]
     ) -> tuple[Scalar, ...]:
-        """Rates, then accelerations under a generalised force, that of the inputs `drive` with it [N m, or N]."""
         return *v, *self.acceleration(q, v, push)
 
     def sensed(
         self, q: Float[Array, " dof"], v: Float[Array, " dof"], u: Float[Array, " input"], push: Float[Array, " dof"]
     ) -> tuple[Scalar, ...]:
-        """`senses` under a generalised force [N m, or N]."""
         return tuple(self.senses(q, v, self.acceleration(q, v, push)))
 
     def senses(
@@ -158,5 +146,4 @@ class AbstractSystem(AbstractPlant):
 
 @eqx.filter_jit
 def _mobility(system: AbstractSystem, q: Float[Array, "pose dof"]) -> Float[Array, "pose dof"]:
-    """Acceleration of every joint by a unit of its own torque."""
     return jax.vmap(lambda q: jnp.diag(jnp.linalg.inv(system.mass(q))))(q)

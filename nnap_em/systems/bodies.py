@@ -14,11 +14,6 @@ from .recursion import NO_INERTIA, Inertia, carried, inertia, united
 from .spatial import Scalar, Three, Turn, about, add, apply, sandwich, scaled, subtract, summed, times, transposed
 
 
-def names(body: Body) -> list[str]:
-    """All that may be estimated of a body."""
-    return [f"{body.name}.{what}" for what in OF_BODY]
-
-
 def numbers(body: Body, values: Mapping[str, Scalar]) -> tuple[Scalar, Three, Turn]:
     """Mass [kg], centre of mass [m] and inertia about it [kg m^2] in the body's frame."""
 
@@ -79,7 +74,7 @@ def kept_physical(machine: Machine, before: Mapping[str, Scalar], after: Mapping
     """`after`, but a body that is estimated in all its numbers and cannot be so is one on the way from `before`."""
     out = dict(after)
     for body in machine.bodies:
-        keys = names(body)
+        keys = [f"{body.name}.{what}" for what in OF_BODY]
         if not set(keys) <= set(after):
             continue
         goal = numbers(body, after)

@@ -2,37 +2,38 @@
 
 from collections.abc import Collection, Mapping
 from functools import partial
-from typing import Any
 
 from ..data.rig import Declaration, SystemSpec, every, nearest
+from ..data.servo import Inputs
+from ..data.table import Table
 from .equations import Text
 from .expression import FUNCTIONS, Formula, FormulaError, parse
 
 
-def declare(root: Any, of: Text | None = None) -> Declaration:
+def declare(root: Table, of: Text | None = None) -> Declaration:
     """The equations of the table [model], or those `of` a Python function; `root` is the whole of rig.toml."""
-    model = root.table("model")
-    own = of or Text({}, {}, {}, {}, ())
-    if of is None:
-        for key in ("states", "rates"):
-            if key not in model.items:
-                model.refuse(key, "missing", 'write states = { h1 = "V" } and rates = { h1 = "k * u - h1" }')
-    units = {name: _unit(table, name) for table in [model.table("units", absent={})] for name in table.items}
-    states, inputs = (_named(model, key, had) for key, had in (("states", own.states), ("inputs", own.inputs)))
+    model, own = root.table("model"), of or Text({}, {}, {}, {}, ())
+    for key in ("states", "rates"):
+        if of is None and key not in model.items:
+            model.refuse(key, "missing", 'write states = { h1 = "V" } and rates = { h1 = "k * u - h1" }')
+    units = model.table("units", absent={})
+    units = {name: _unit(units, name) for name in units.items}
+    states, inputs = _named(model, "states", own.states), _named(model, "inputs", own.inputs)
     reserved = ("type", "inputs", "states", "rates", "unknown", "units")
     parameters = {key: model.quantity(key) for key in model.items if key not in reserved}
     unknown = model.table("unknown", absent={})
     _distinct(model, states, inputs, parameters, unknown.items)
-    if of is not None:
-        model.check(("type", *of.parameters), ("units", "unknown"))
-    terms = every(**{name: partial(_term, unknown, name, states, inputs) for name in unknown.items})
+    terms = every({name: partial(_term, unknown, name, states, inputs) for name in unknown.items})
     named = {name: signals for name, (port, signals) in terms.items() if not port}
     known = (*states, *inputs, *parameters, *named)
     rates = {} if of is not None else _rates(model, states, known)
     readings = _readings(root.table("measurement"), states, known)
-    if of is None:
-        _used(model, (*rates.values(), *readings.values()), parameters, inputs)
-        _used(unknown, (*rates.values(), *readings.values()), named)
+    if of is not None:
+        model.check(("type", *of.parameters), ("units", "unknown"))
+    else:
+        formulas = (*rates.values(), *readings.values())
+        _used(model, formulas, {**parameters, **inputs})
+        _used(unknown, formulas, named)
     inherited = {name: states[formula.text] for name, formula in readings.items() if states.get(formula.text)}
     text = Text(
         states,
@@ -46,10 +47,10 @@ def declare(root: Any, of: Text | None = None) -> Declaration:
         own.function,
     )
     spec = SystemSpec(tuple(states), tuple(parameters), {}, 0, sensors=tuple(readings))
-    return Declaration(spec, parameters, tuple(inputs), tuple(range(1, len(inputs) + 1)), equations=text.packed)
+    return Declaration(spec, parameters, Inputs(tuple(inputs), tuple(range(1, len(inputs) + 1))), equations=text.packed)
 
 
-def _named(model: Any, key: str, had: Mapping[str, str]) -> dict[str, str]:
+def _named(model: Table, key: str, had: Mapping[str, str]) -> dict[str, str]:
     """Names with their units, empty where none is declared."""
     items = model.items.get(key, dict(had) or ([] if key == "inputs" else None))
     if isinstance(items, list):
@@ -63,7 +64,7 @@ def _named(model: Any, key: str, had: Mapping[str, str]) -> dict[str, str]:
     return {name: _unit(table, name) for name in table.items}
 
 
-def _unit(table: Any, name: str) -> str:
+def _unit(table: Table, name: str) -> str:
     """The unit of a name."""
     unit = table.items[name]
     if not isinstance(unit, str) or not unit:
@@ -73,7 +74,7 @@ def _unit(table: Any, name: str) -> str:
     return unit
 
 
-def _distinct(model: Any, *parts: Collection[str]) -> None:
+def _distinct(model: Table, *parts: Collection[str]) -> None:
     """Refuse names that are no names, that formulas use otherwise, and names that stand twice."""
     seen: set[str] = set()
     for name in (name for part in parts for name in part):
@@ -86,7 +87,7 @@ def _distinct(model: Any, *parts: Collection[str]) -> None:
         seen.add(name)
 
 
-def _rates(model: Any, states: Collection[str], known: Collection[str]) -> dict[str, Formula]:
+def _rates(model: Table, states: Collection[str], known: Collection[str]) -> dict[str, Formula]:
     """The formula of every state."""
     rates = model.table("rates")
     for name in rates.items:
@@ -95,10 +96,10 @@ def _rates(model: Any, states: Collection[str], known: Collection[str]) -> dict[
     for name in states:
         if name not in rates.items:
             rates.refuse(name, "a state without rate", f'write {name} = "..." , its derivative by time [1/s]')
-    return every(**{name: partial(_formula, rates, name, known) for name in states})
+    return every({name: partial(_formula, rates, name, known) for name in states})
 
 
-def _formula(table: Any, key: str, known: Collection[str]) -> Formula:
+def _formula(table: Table, key: str, known: Collection[str]) -> Formula:
     text = table.items[key]
     text = str(text) if type(text) in (int, float) else text
     if not isinstance(text, str):
@@ -110,7 +111,7 @@ def _formula(table: Any, key: str, known: Collection[str]) -> Formula:
         return table.refuse(key, problem, hint)
 
 
-def _readings(measurement: Any, states: Collection[str], known: Collection[str]) -> dict[str, Formula]:
+def _readings(measurement: Table, states: Collection[str], known: Collection[str]) -> dict[str, Formula]:
     """Formulas of the columns that are no states."""
     columns = measurement.value("columns")
     if not isinstance(columns, Mapping):
@@ -120,7 +121,7 @@ def _readings(measurement: Any, states: Collection[str], known: Collection[str])
                 measurement.refuse("columns", f"{name!r} is no state", hint)
         return {}
     table = measurement.table("columns")
-    formulas = every(**{name: partial(_formula, table, name, known) for name in table.items})
+    formulas = every({name: partial(_formula, table, name, known) for name in table.items})
     for name, formula in formulas.items():
         if name in states and formula.text != name:
             table.refuse(
@@ -129,7 +130,7 @@ def _readings(measurement: Any, states: Collection[str], known: Collection[str])
     return {name: formula for name, formula in formulas.items() if name not in states}
 
 
-def _term(unknown: Any, name: str, states: Collection[str], inputs: Collection[str]) -> tuple[str, tuple[str, ...]]:
+def _term(unknown: Table, name: str, states: Collection[str], inputs: Collection[str]) -> tuple[str, tuple[str, ...]]:
     """State that an unknown term enters, or nothing where it stands in a formula, and its signals."""
     table = unknown.table(name)
     table.check(("signals",), ("enters",))
@@ -143,9 +144,9 @@ def _term(unknown: Any, name: str, states: Collection[str], inputs: Collection[s
     return (table.choice("enters", states) if "enters" in table.items else ""), signals
 
 
-def _used(table: Any, formulas: Collection[Formula], *parts: Collection[str]) -> None:
+def _used(table: Table, formulas: Collection[Formula], names: Collection[str]) -> None:
     """Refuse names that no formula has."""
     used = {name for formula in formulas for name in formula.names}
-    for name in (name for part in parts for name in part):
+    for name in names:
         if name not in used:
             table.refuse(name, "no equation and no reading uses it", "use it, or take it out")

@@ -43,7 +43,6 @@ class Text(NamedTuple):
         return json.dumps(self._asdict(), ensure_ascii=False)
 
     def unit(self, name: str) -> str:
-        """Unit of a state, input, parameter or reading; empty where it has none."""
         return {**self.states, **self.inputs, **self.units}.get(name, "")
 
 
@@ -85,7 +84,6 @@ class Equations(AbstractPlant):
 
     @classmethod
     def declared(cls, parameters: Mapping[str, Array], joints: tuple[int, ...], text: str) -> "Equations":
-        """The equations of these numbers."""
         return cls(dict(parameters), text)
 
     @property
@@ -95,40 +93,32 @@ class Equations(AbstractPlant):
 
     @property
     def states(self) -> tuple[str, ...]:
-        """States in their order."""
         return tuple(self.of.states)
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """Inputs in their order."""
         return tuple(self.of.inputs)
 
     @property
     def ports(self) -> tuple[str, ...]:
-        """States, to whose rates something may add, then unknown terms."""
         return (*self.of.states, *self.of.terms)
 
     @property
     def open_ports(self) -> tuple[str, ...]:
-        """All of them."""
         return self.ports
 
     @property
     def sensors(self) -> dict[str, str]:
-        """Columns with a formula, and their units."""
         return {name: self.unit(name) for name in self.of.readings}
 
     @property
     def senses_push(self) -> bool:
-        """True where an unknown term stands in the formula of a reading."""
         return any(set(formula.names) & set(self.of.terms) for formula in _formulas(self.text)[1])
 
     def parameter(self, name: str) -> Any:
-        """A parameter by its name."""
         return self.values[name]
 
     def with_parameters(self, values: Mapping[str, Array]) -> "Equations":
-        """The equations with other values of some parameters."""
         return replace(self, values={**self.values, **values})
 
     def __str__(self) -> str:
@@ -136,46 +126,36 @@ class Equations(AbstractPlant):
         return f"Equations of {', '.join(self.states)}: {quantities(numbers, self.unit)}".rstrip(": ")
 
     def unit(self, name: str) -> str:
-        """Unit of a state, sensor, input or parameter."""
         return self.of.unit(name)
 
     def port_unit(self, port: int) -> str:
-        """Unit of the push at a port, counted from 1."""
         name = self.ports[port - 1]
         unit = self.unit(name)
         return (f"{unit}/s" if unit else "1/s") if name in self.of.states else unit
 
     def input_of(self, joint: int | None, channel: str | None) -> int | None:
-        """Index of an input by its name."""
         return self.inputs.index(channel) if channel in self.inputs else None
 
     def split(self, x: Float[Array, " state"]) -> tuple[Float[Array, " dof"], Float[Array, " rate"]]:
-        """All states, and nothing."""
         return x[: len(self.of.states)], x[:0]
 
     def drive(self, u: Float[Array, " input"]) -> Float[Array, " port"]:
-        """None: inputs stand in the equations."""
         return jnp.zeros(len(self.ports), u.dtype)
 
     def mobility(self) -> Float[np.ndarray, " port"]:
-        """None: there are no joints."""
         return np.zeros(len(self.ports))
 
     def push_of(self, q: Float[Array, " dof"], change: Float[Array, "node state"]) -> Float[Array, "node state"]:
-        """The change itself."""
         return change
 
     @property
     def drives(self) -> list[dict[str, Any]]:
-        """All inputs."""
         return [{"channel": name} for name in self.of.inputs]
 
     def late(self, law, u):
-        """The law of the difference from the first row."""
         return u[0] + law(u - u[0])
 
     def at_ports(self, torque: Float[Array, " dof"]) -> Float[Array, " port"]:
-        """None: there are no joints."""
         return jnp.zeros(len(self.ports), torque.dtype)
 
     def named(
@@ -188,7 +168,6 @@ class Equations(AbstractPlant):
         return {**self.values, **states, **inputs, **dict(zip(of.terms, terms, strict=True))}
 
     def slopes(self, q, v, u, push):
-        """Derivatives of all states."""
         values, of = self.named(q, u, push), self.of
         if of.function:
             parts = (of.states, of.inputs, self.values)
@@ -199,7 +178,6 @@ class Equations(AbstractPlant):
         return tuple(jnp.asarray(rate, q.dtype) + push[i] for i, rate in enumerate(rates))
 
     def sensed(self, q, v, u, push):
-        """Values of the formulas of readings."""
         values = self.named(q, u, push)
         return tuple(jnp.asarray(formula.of(values), q.dtype) for formula in _formulas(self.text)[1])
 

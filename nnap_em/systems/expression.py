@@ -1,12 +1,12 @@
 """Formulas of rig.toml: text in, function of named numbers out; parsed, never evaluated as Python."""
 
 import ast
-import difflib
 from collections.abc import Callable, Collection, Mapping
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 
+from ..data.rig import nearest
 from .plant import Scalar
 
 Values = Mapping[str, Any]
@@ -62,9 +62,8 @@ def parse(text: str, known: Collection[str]) -> Formula:
     try:
         tree = ast.parse(text.replace("^", "**"), mode="eval").body
     except SyntaxError as error:
-        raise FormulaError(
-            f"{_mark(text, (error.offset or 1) - 1)}: not a formula; write such as k * sqrt(h)"
-        ) from None
+        place = _mark(text, (error.offset or 1) - 1)
+        raise FormulaError(f"{place}: not a formula; write such as k * sqrt(h)") from None
     names: dict[str, None] = {}
 
     def refuse(node: ast.AST, problem: str, hint: str) -> None:
@@ -81,7 +80,7 @@ def parse(text: str, known: Collection[str]) -> Formula:
                 names[name] = None
                 return lambda values: values[name]
             case ast.Name(id=name):
-                refuse(node, f"unknown name {name!r}", _nearest(name, known))
+                refuse(node, f"unknown name {name!r}", nearest(name, known))
             case ast.UnaryOp(op=op, operand=one) if type(op) in _OPERATORS:
                 operate, first = _OPERATORS[type(op)], built(one)
                 return lambda values: operate(first(values))
@@ -92,7 +91,7 @@ def parse(text: str, known: Collection[str]) -> Formula:
                 return lambda values: operate(first(values), second(values))
             case ast.Call(func=ast.Name(id=name), args=arguments, keywords=[]):
                 if name not in FUNCTIONS:
-                    refuse(node, f"unknown function {name!r}", _nearest(name, FUNCTIONS))
+                    refuse(node, f"unknown function {name!r}", nearest(name, FUNCTIONS))
                 count, function = FUNCTIONS[name]
                 if len(arguments) != count:
                     refuse(node, f"{name} takes {count} arguments, found {len(arguments)}", "correct it")
@@ -113,8 +112,3 @@ def _mark(text: str, column: int) -> str:
             return f"at character {place + 1} of {text!r}"
         seen += 2 if letter == "^" else 1
     return f"at the end of {text!r}"
-
-
-def _nearest(name: str, known: Collection[str]) -> str:
-    close = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
-    return (f"did you mean {close[0]!r}? " if close else "") + f"possible here: {', '.join(known)}"

@@ -55,7 +55,6 @@ class Tree(AbstractSystem):
 
     @property
     def machine(self) -> Machine:
-        """The compiled file."""
         return unpacked(self.text)
 
     def parameter(self, name):
@@ -73,7 +72,6 @@ class Tree(AbstractSystem):
 
     @property
     def sensors(self) -> dict[str, str]:
-        """Measured sensors of the file."""
         return {sensor.name: SENSE_UNITS[sensor.kind] for sensor in self.machine.sensors}
 
     @property
@@ -87,7 +85,6 @@ class Tree(AbstractSystem):
 
     @property
     def variations(self) -> dict[tuple[str, int], tuple[Callable[..., Any], Callable[..., Any]]]:
-        """A point mass at the spot of every outermost joint."""
         return {
             ("payload", joint): (
                 lambda tree, mass, joint=joint: tree.loaded(joint, mass, jnp.zeros(3, mass.dtype)),
@@ -98,7 +95,6 @@ class Tree(AbstractSystem):
 
     @property
     def spots(self) -> dict[int, LoadPoint]:
-        """Places of candidate loads, by the joint that carries it."""
         return spots(self.machine, laid(self.text))
 
     def loaded(self, joint, mass, moment):

@@ -22,9 +22,8 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from nnap_em.data.rig import Declared, Rig
-from nnap_em.em.local import local, readings_at
 from nnap_em.em.loop import Schedule, e_step, em_step
-from nnap_em.em.quadratic import quadratic
+from nnap_em.em.quadratic import local, quadratic, readings_at
 from nnap_em.fit.identify import Identified, begin, friction_table, identify
 from nnap_em.fit.predict import predict
 from nnap_em.model.friction import FixedFriction
@@ -95,7 +94,7 @@ def cramer_rao(truth_fit: Identified, fitted: Identified, truth, smoother, data,
     @jax.vmap
     def information_of(posterior, seq):
         linear = local(model, fitted.m_step.prior, posterior.state, seq)
-        read = readings_at(model, posterior, linear.seq)
+        read = readings_at(model, (posterior, linear.seq))
         return quadratic(model.log_q, model.log_r, model.start, linear, nodes, posterior, read).information
 
     information = jnp.sum(information_of(posterior, data), axis=0)

@@ -159,15 +159,15 @@ def test_smoothers_equal_the_dense_joint_for_every_pattern_of_missing_readings(r
 
 def test_likeliest_start_weighs_prior_and_readings():
     """The hypothesis with the largest prior times likelihood, by the dense joint."""
-    smoother, away, seen = GaussianSmoother(StartBank((9, 1, 1)), Tangent()), np.linspace(-2.5, 2.5, 9), np.ones((4, 2))
+    bank, away, seen = StartBank((9, 1, 1)), np.linspace(-2.5, 2.5, 9), np.ones((4, 2))
     problems = [_problem(seed, time=4) for seed in range(6)]
     problems = [p._replace(model=eqx.tree_at(lambda m: m.log_r, p.model, p.model.log_r + 1)) for p in problems]
 
     @jax.jit
     @jax.vmap
     def run(p):
-        starts, _ = smoother.bank.hypotheses(p.start)
-        return starts, smoother.likeliest(p.model, Prepared(p.u, p.y, jnp.ones((4, 2), bool), _active(4))).mean
+        seq = Prepared(p.u, p.y, jnp.ones((4, 2), bool), _active(4))
+        return bank.hypotheses(p.start)[0], bank.likeliest(p.model, seq, Tangent(), 60).mean
 
     starts, chosen = run(jax.tree.map(lambda *a: jnp.stack(a), *problems))
     best = []
@@ -286,19 +286,3 @@ def test_cubature_has_the_slope_and_mean_of_a_polynomial():
     np.testing.assert_allclose(mean, [m**2 + s**2, m**3 + 3 * m * s**2], rtol=1e-13)
     np.testing.assert_allclose(affine.matrix[0], [2 * m, 0.0], rtol=1e-13, atol=1e-13)
     assert np.all(np.linalg.eigvalsh(affine.noise) > -1e-15)
-
-
-def test_padding_changes_no_digit():
-    """Four rows of sixty, in the programs of other tests."""
-    p = _problem(7, time=4)
-    observed = np.random.default_rng(7).uniform(size=(4, 2)) < 0.7
-    longer = jax.tree.map(lambda a: jnp.concatenate([a, jnp.full((56, *a.shape[1:]), 3.3)]), (p.affine, p.y, p.u))
-    padded = p._replace(affine=longer[0], y=longer[1], u=longer[2])
-    wide = np.concatenate([observed, np.zeros((56, 2), bool)])
-    short = _run(p, jnp.asarray(observed), _active(4))
-    long = _run(padded, jnp.asarray(wide), jnp.arange(60) < 3)
-    np.testing.assert_array_equal(short[0].loglik, long[0].loglik)
-    np.testing.assert_array_equal(short[0].state.mean, long[0].state.mean[:4])
-    # the smoother passes the padding by solving with the state's own covariance: rounding, and no more
-    np.testing.assert_allclose(short[1].state.mean, long[1].state.mean[:4], rtol=1e-12, atol=1e-12)
-    np.testing.assert_allclose(short[1].state.cov, long[1].state.cov[:4], rtol=1e-12, atol=1e-12)

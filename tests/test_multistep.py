@@ -16,22 +16,22 @@ from nnap_em.diagnosis.smoothed import SmoothedFit
 from nnap_em.effects import Candidate, catalogue
 from nnap_em.em import multistep
 from nnap_em.em.build import build
-from nnap_em.em.local import local
 from nnap_em.em.multistep import (
     OpenLoop,
     errors,
     finish,
     followed,
-    grid_of,
+    grid_along,
     huber,
     open_loop,
     ratio,
     robust_scale,
     weighed,
 )
-from nnap_em.em.noise import third_differences, white_readings
 from nnap_em.em.prior import ParameterPrior
-from nnap_em.em.shape import friction_prior
+from nnap_em.em.quadratic import local
+from nnap_em.em.readings import third_differences, white_readings
+from nnap_em.em.weights import friction_prior
 from nnap_em.model.base import prepare
 from nnap_em.model.simulate import declared, examples, paper_model
 from nnap_em.model.state_space import with_effects
@@ -77,7 +77,7 @@ def _followed(known, model=None):
 
 def test_errors_are_those_of_the_model_run_alone(known):
     """None on its own motion; on that of a heavier machine, the difference of the two from the same starts."""
-    grid = grid_of(known.model.dt, ROWS)
+    grid = grid_along(known.model, known.data)
     starts, ages = grid.starts(ROWS), list(grid.ages)
     along = _followed(known)
     error = errors(along)

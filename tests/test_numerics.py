@@ -19,7 +19,7 @@ from nnap_em.numerics.gaussian import (
 )
 from nnap_em.numerics.random import normals, threefry
 from nnap_em.numerics.rows import ROWS_AT_ONCE, rows
-from nnap_em.smoother.particle.resampling import cumsum
+from nnap_em.smoother.particle.filter import cumsum
 
 EPS = np.finfo(float).eps
 

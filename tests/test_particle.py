@@ -25,7 +25,7 @@ from nnap_em.smoother.particle import (
     ffbs,
     particle_filter,
 )
-from nnap_em.smoother.particle.resampling import systematic
+from nnap_em.smoother.particle.filter import systematic
 from nnap_em.smoother.start import StartBank
 
 PROPOSALS = {"bootstrap": Bootstrap(), "guided": Guided(), "lookahead": Lookahead(1.0)}
@@ -101,7 +101,7 @@ def _exact():
 
     @jax.jit
     def run():
-        path = GUIDE.path(model, prepare(model, seq))
+        path = GUIDE.tracked(model, prepare(model, seq))[:2]
         potentials = {name: proposal(model, prepare(model, seq), *path) for name, proposal in PROPOSALS.items()}
         return *path, potentials, jax.grad(loglik, argnums=(0, 1, 2))(model.log_q, model.log_r, jnp.zeros(2))
 

@@ -23,10 +23,9 @@ from nnap_em.data.machine import unpacked
 from nnap_em.data.rig import RigError, read_rig
 from nnap_em.effects.sensor import SensorBias
 from nnap_em.em.build import build_system
-from nnap_em.em.local import local, readings_at
 from nnap_em.em.mstep import _noise_floor
 from nnap_em.em.prior import ParameterPrior
-from nnap_em.em.quadratic import quadratic
+from nnap_em.em.quadratic import local, quadratic, readings_at
 from nnap_em.export.mjcf import write_mjcf
 from nnap_em.export.model import parameters
 from nnap_em.fit.identify import begin
@@ -145,7 +144,7 @@ def _expanded(model, prior, data: Dataset):
     seq = jax.tree.map(lambda a: a[0], data)
     prepared = prepare(model, seq)
     posterior = ExtendedKalmanSmoother(StartBank((1, 1)), iterations=20)(model, prepared)
-    linear, read = local(model, prior, posterior.state, seq), readings_at(model, posterior, prepared)
+    linear, read = local(model, prior, posterior.state, seq), readings_at(model, (posterior, prepared))
     expansion = quadratic(model.log_q, model.log_r, model.start, linear, NODES, posterior, read)
 
     def filtered(knobs):

@@ -5,11 +5,10 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 
 from nnap_em.data.dataset import Dataset
 from nnap_em.data.rig import Declared
-from nnap_em.em.build import ALL_STARTS, MOVED, RATE_STARTS, build, measure_scales, read_at_start
+from nnap_em.em.build import ALL_STARTS, RATE_STARTS, build
 from nnap_em.model.simulate import declared, examples, paper_model
 
 KEY = jax.random.key(0)
@@ -43,15 +42,3 @@ def test_an_angle_that_is_read_late_has_hypotheses():
     both = dataclasses.replace(arm, measured=(0, 1))
     counts = _counts("acrobot", both, LATE)
     assert np.prod(counts) <= ALL_STARTS and np.prod(counts[2:]) <= RATE_STARTS and counts[:2] == [13, 13]
-
-
-@pytest.mark.parametrize(("more", "read"), [(-1, True), (1, False)])
-def test_late_is_what_lets_it_move(more, read):
-    """One row to either side of the moment at which the joint may have moved `MOVED`, in one sequence of three."""
-    model = examples["pendulum"]().model
-    data, rig = _swung(model), declared("pendulum", model)
-    scales, rig = measure_scales(rig, model.system, data), dataclasses.replace(rig, dt=1e-3)
-    rows = int(MOVED / (scales.speed[0] * rig.dt)) + (more > 0)
-    assert 0 < rows < ROWS
-    data = data._replace(y=data.y.at[2, :rows].set(jnp.nan))
-    assert (rig.measured[0] in read_at_start(rig, model.system, data, scales)) == read

@@ -161,7 +161,7 @@ def _afresh(context: SearchContext, hypothesis: Hypothesis) -> Callable[[], EMSt
     fresh = Hypothesis(weights.write(start.model, weights.middle()), rule).having(hypothesis.additions)
     brief, state = horizon(context.data, SCHEDULE.first), start_state(fresh.model, fresh.m_step, key=before.state.key)
     try:
-        state = fit(state, context.data, before.smoother, fresh.m_step, epochs=SCHEDULE.at_first)
+        state = fit(state, context.data, before.smoother, fresh.m_step, epochs=SCHEDULE.hold + 1)
     except FitError:
         return None
     own = e_step(hypothesis.model, brief, before.smoother, key=before.state.key)

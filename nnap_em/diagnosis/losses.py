@@ -67,7 +67,8 @@ class MultiStep(eqx.Module):
         machine = eqx.tree_at(lambda m: m.unknown, fit.declared.model, model.unknown)  # on which candidates act
         every = tuple(sorted(set(sum(self.bands, ()))))
         bands = [[every.index(h) for h in band] for band in self.bands]
-        follows, rows = multistep.followed(model, weights.prior, path, data), multistep.starts(model, data, every)
+        follows = multistep.followed(model, weights.prior, path, data)
+        rows = multistep.grid_along(model, data, every).starts(data.t.shape[1])
         track = jax.tree.map(np.asarray, tracks(model, path, follows.linear.seq.inputs))
         error, own = multistep.errors(follows, every), weights.nodes.size + weights.prior.size
         size = whole_step(max(sum(len(one.probes) for one in block) for block in blocks))  # columns of 0 fill them up

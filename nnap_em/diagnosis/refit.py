@@ -13,9 +13,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from ..data.dataset import Dataset
-from ..em.local import locals_along
 from ..em.mstep import Core, ScoringMStep, between
 from ..em.multistep import Followed
+from ..em.quadratic import locals_along
 from ..model.state_space import StateSpaceModel
 from ..numerics.gaussian import Gaussian
 from ..numerics.parallel import each

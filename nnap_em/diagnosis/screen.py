@@ -16,7 +16,7 @@ from scipy.linalg import cho_factor, cho_solve
 
 from ..data.dataset import Dataset
 from ..effects import Candidate, fields
-from ..em.shape import friction_prior
+from ..em.weights import friction_prior
 from ..model.state_space import StateSpaceModel
 from ..numerics.gaussian import Gaussian
 from ..storage.journal import HERE, step

@@ -19,7 +19,7 @@ from ..data.logs import Logs, sequences_of
 from ..data.rig import Rig
 from ..em.loop import EMState, FitError, e_step
 from ..em.mstep import ScoringMStep, not_diverged
-from ..em.noise import white_readings
+from ..em.readings import white_readings
 from ..fit.identify import Identified, begin, finished, identify
 from ..fit.known import forgotten, known, unheld
 from ..model.state_space import StateSpaceModel

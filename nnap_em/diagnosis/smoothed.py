@@ -10,7 +10,8 @@ from jaxtyping import Bool
 from ..data.dataset import Dataset
 from ..em.loop import e_step
 from ..em.mstep import ScoringMStep, not_diverged
-from ..em.recorded import Risen, errors_of, left_out, level, levels, risen
+from ..em.multistep import errors, followed
+from ..em.recorded import Risen, left_out, level, risen
 from ..fit.identify import Identified
 from ..model.state_space import StateSpaceModel
 from ..numerics.gaussian import Gaussian
@@ -54,8 +55,10 @@ def along(fitted: Identified, data: Dataset, smoother: AbstractSmoother) -> Smoo
 
 def risen_since(own: SmoothedFit, now: SmoothedFit) -> Risen:
     """Test of whether the errors of a fit are larger on new recordings than on its own, each left out."""
-    out = levels(left_out(own.model, own.m_step, own.path, own.data, own.used))
-    return risen(out.level, level(errors_of(now.model, now.m_step, now.path, now.data), out.scale))
+    out = left_out(own.model, own.m_step, own.path, own.data, own.used)
+    scale = np.nanmedian(np.abs(out), axis=(0, 1)) * 1.4826 + 1e-12  # larger errors than twice this weigh less
+    new = errors(followed(now.model, now.m_step.prior, now.path, now.data))
+    return risen(level(out, scale), level(new, scale))
 
 
 def extended(model: StateSpaceModel, path: Gaussian, data: Dataset) -> Gaussian:

@@ -1,7 +1,7 @@
 """Numbers that decide whether an effect enters a model or leaves it, and the decisions.
 
 The search measures; this file decides.  A share is the part of a squared error that a candidate removes [0 to 1].
-Elsewhere: READINGS (`em/noise.py`), the bars of `statistics.py`, `interventions.py` and `shapes.py`; and counts of
+Elsewhere: READINGS (`em/readings.py`), the bars of `statistics.py`, `interventions.py` and `shapes.py`; and counts of
 parts, placebos, laws and passes, each where it counts.
 """
 

@@ -18,7 +18,7 @@ from ..smoother.start import StartBank
 from ..systems import AbstractSystem, systems
 from .equations import build_equations
 from .mstep import RESTING_OFFSET, RESTING_STEP, ScoringMStep
-from .prior import ParameterPrior
+from .prior import declared_prior
 from .readings import RESTS, at_rest, reading_noise
 from .servos import LAG, build_servos, steps_of_sample, torque_along
 
@@ -26,14 +26,11 @@ NO_MACHINE = "the declared masses and inertias make no machine"
 
 
 class Scales(NamedTuple):
-    """Sizes of motion and torque, per joint, read off the logs and the declared physics."""
+    """Largest velocity [rad/s], typical acceleration [rad/s^2] and torque of gravity and drive [N m] of every joint."""
 
     speed: Float[np.ndarray, " dof"]
-    """Largest velocity [rad/s]."""
     acceleration: Float[np.ndarray, " dof"]
-    """Typical acceleration [rad/s^2]."""
     torque: Float[np.ndarray, " dof"]
-    """Typical torque of gravity and drive [N m]."""
 
 
 class Problem(NamedTuple):
@@ -45,10 +42,7 @@ class Problem(NamedTuple):
 
 
 def build_system(rig: Rig) -> Any:
-    """The declared physics, at the mean of what is uncertain.
-
-    Raises RigError where its mass matrix is not positive definite.
-    """
+    """The declared physics, at the mean of what is uncertain; RigError where its mass matrix is not positive."""
     values = {name: jnp.asarray(declared.mean, float) for name, declared in rig.bodies.items()}
     system = systems[rig.system].declared(values, rig.input_joints, rig.machine or rig.equations)
     if rig.equations:
@@ -65,9 +59,8 @@ def _masses(system: AbstractSystem, q: Float[Array, "pose dof"]) -> Float[Array,
 
 
 def derivatives(signal: Float[np.ndarray, "seq time"], order: int, dt: float) -> list[Float[np.ndarray, " reading"]]:
-    """Derivatives of each sequence by differences over `LAG` rows, or over one reading where these are further apart.
-
-    Missing samples are bridged, since readings of every other row are never `LAG` rows apart.
+    """Derivatives of each sequence by differences over `LAG` rows, missing samples bridged, or over one reading where
+    these are further apart.
     """
     out = []
     for y in signal:
@@ -135,7 +128,7 @@ def measure_scales(rig: Rig, system: AbstractSystem, data: Dataset) -> Scales:
 def start_prior(rig: Rig, system: AbstractSystem, data: Dataset, scales: Scales) -> tuple[Gaussian, tuple[bool, ...]]:
     """Prior of the first state, and which of its entries nobody declared or measured (EM learns those)."""
     y = np.asarray(data.y)
-    means, stds, open_ = [], [], []
+    every = []
     for i, name in enumerate(system.coordinates + system.rates):
         joint, is_rate = i % len(system.coordinates), i >= len(system.coordinates)
         if name in rig.start:
@@ -149,10 +142,9 @@ def start_prior(rig: Rig, system: AbstractSystem, data: Dataset, scales: Scales)
             mean, std, free = 0.0, float(scales.speed[joint]) / 3, True
         else:
             mean, std, free = 0.0, np.pi / 2 if system.angles[joint] else 1.0, True
-        means.append(mean)
-        stds.append(std)
-        open_.append(free)
-    return Gaussian(jnp.asarray(means), jnp.asarray(np.diag(np.square(stds)))), tuple(open_)
+        every.append((mean, std, free))
+    means, stds, open_ = zip(*every, strict=True)
+    return Gaussian(jnp.asarray(means), jnp.asarray(np.diag(np.square(stds)))), open_
 
 
 def build(rig: Rig, data: Dataset, *, key: PRNGKeyArray) -> Problem:
@@ -163,13 +155,11 @@ def build(rig: Rig, data: Dataset, *, key: PRNGKeyArray) -> Problem:
         mstep = ScoringMStep(prior, jnp.zeros(0), learned, estimated, log_q_prior=model.log_q, quiet=quiet)
         return Problem(model, mstep, StartBank((1,) * len(system.states)))
     scales = measure_scales(rig, system, data)
-    states = system.coordinates + system.rates
     start, open_ = start_prior(rig, system, data, scales)
     kick = scales.acceleration * rig.dt
     declared = [rig.noise_std.get(n) for n in rig.measured]
-    noise = [
-        d if d is not None else max(2 * reading_noise(np.asarray(data.y)[..., i]), 1e-9) for i, d in enumerate(declared)
-    ]
+    y = np.asarray(data.y)
+    noise = [max(2 * reading_noise(y[..., i]), 1e-9) if d is None else d for i, d in enumerate(declared)]
     places = [system.readable.index(name) for name in rig.measured]
     shaken = _by_acceleration(system, scales)[places]
     unknown = NoFriction(jnp.asarray(0.1 * scales.torque))
@@ -191,26 +181,17 @@ def build(rig: Rig, data: Dataset, *, key: PRNGKeyArray) -> Problem:
         servos=servos or None,
         smooth=rig.input_hold == SMOOTH,
     )
-    free = tuple(n for n, d in rig.parameters.items() if d.std > 0)
-    prior = ParameterPrior(
-        free, jnp.asarray([rig.parameters[n].mean for n in free]), jnp.asarray([rig.parameters[n].std for n in free])
-    )
+    prior = declared_prior(rig.parameters)
     estimated = tuple(d is None or bool(s) for d, s in zip(declared, shaken, strict=True))
-    least = (jnp.asarray([system.least(name) for name in free], float) - prior.mean) / prior.std
-    y = np.asarray(data.y)
+    least = (jnp.asarray([system.least(name) for name in prior.names], float) - prior.mean) / prior.std
     rests = max((at_rest(y[..., i]) for i, name in enumerate(rig.measured) if name in system.coordinates), default=0.0)
     coarse = RESTING_OFFSET if rests > RESTS else math.inf
-    reach = np.where(rests > RESTS, RESTING_STEP * _driven(system, scales), math.inf)
-    mstep = ScoringMStep(
-        prior, unknown.weights(), open_, estimated, coarse=coarse, reach=reach, log_q_prior=model.log_q, least=least
-    )
-    return Problem(model, mstep, start_bank(model, states, read_at_start(rig, system, data, scales), rig, system))
-
-
-def _driven(system: AbstractSystem, scales: Scales) -> Float[np.ndarray, " dof"]:
-    """Typical torque of the drive of each joint; of a joint without one, of gravity and coupling [N m, or N]."""
-    torque = scales.torque - loads(system)[1]
-    return np.where(torque > 1e-3 * scales.torque, torque, scales.torque)
+    drive = scales.torque - loads(system)[1]  # of a joint without one, gravity and coupling stand for it
+    drive = np.where(drive > 1e-3 * scales.torque, drive, scales.torque)
+    reach = np.where(rests > RESTS, RESTING_STEP * drive, math.inf)
+    options = {"coarse": coarse, "reach": reach, "log_q_prior": model.log_q, "least": least}
+    mstep = ScoringMStep(prior, unknown.weights(), open_, estimated, **options)
+    return Problem(model, mstep, start_bank(model, read_at_start(rig, system, data, scales), rig, system))
 
 
 def _by_acceleration(system: AbstractSystem, scales: Scales) -> Float[np.ndarray, " readable"]:
@@ -246,13 +227,9 @@ def read_at_start(rig: Rig, system: AbstractSystem, data: Dataset, scales: Scale
     return tuple(out)
 
 
-def start_bank(
-    model: StateSpaceModel, states: tuple[str, ...], read: tuple[str, ...], rig: Rig, system: AbstractSystem
-) -> StartBank:
-    """Hypotheses for each state that is not `read` at the start and that the prior leaves wide.
-
-    One for each rate of a measured joint where these would be more than `RATE_STARTS`, or all more than `ALL_STARTS`;
-    then one for every measured state.
+def start_bank(model: StateSpaceModel, read: tuple[str, ...], rig: Rig, system: AbstractSystem) -> StartBank:
+    """Hypotheses for each state that is not `read` at the start and that the prior leaves wide, within the bounds of
+    `RATE_STARTS` and `ALL_STARTS`.
     """
     spread = np.sqrt(np.diag(np.asarray(model.start.cov)))
     dof = len(system.coordinates)
@@ -260,7 +237,7 @@ def start_bank(
 
     def hypotheses(known: tuple[str, ...]) -> list[int]:
         counts = []
-        for i, name in enumerate(states):
+        for i, name in enumerate(system.coordinates + system.rates):
             wide = spread[i] * (0.2 if i >= dof else 1.0) > MOVED
             counts.append((5 if i >= dof else 13) if wide and name not in known and system.angles[i % dof] else 1)
         if math.prod(counts[i] for i in measured) > RATE_STARTS or math.prod(counts) > ALL_STARTS:

@@ -21,7 +21,7 @@ from ..numerics.digits import counted
 from ..numerics.gaussian import Gaussian
 from ..numerics.parallel import each
 from ..systems.equations import Equations
-from .prior import ParameterPrior
+from .prior import ParameterPrior, declared_prior
 from .readings import reading_noise
 from .simulated import filter_path
 
@@ -60,10 +60,7 @@ def _rates(system: Equations, x: Float[Array, "row state"], u: Float[Array, "row
 
 
 def resting(system: Equations, known: dict[int, float], u: Float[np.ndarray, " input"]) -> Float[np.ndarray, " state"]:
-    """State in which the equations are nearest to rest at inputs `u`, with some states as they are `known`.
-
-    By least squares of all rates, from 1; 1 where these are infinite there.
-    """
+    """State of the least sum of squared rates at inputs `u`, with some states as they are `known`; from 1, or 1."""
     x = np.array([known.get(i, 1.0) for i in range(len(system.states))])
     free = [i for i in range(len(x)) if i not in known]
 
@@ -84,31 +81,25 @@ def start_prior(rig: Rig, system: Equations, data: Dataset) -> tuple[Gaussian, t
     known = {i: float(np.nanmean(y[..., columns[name]])) for i, name in enumerate(system.states) if name in columns}
     known |= {i: rig.start[name].mean for i, name in enumerate(system.states) if name in rig.start and i not in known}
     rest = resting(system, known, u.mean(axis=0))
-    means, stds, learned = [], [], []
-    # Standard deviation of the start of a state that nobody declares or reads, in its size where the equations rest
-    hidden = 0.5
+    pairs = []
     for i, name in enumerate(system.states):
-        read = name in columns
         if name in rig.start:
             mean, std = rig.start[name].mean, max(rig.start[name].std, 1e-9)
-        elif read:
+        elif name in columns:
             signal = y[..., columns[name]]
             first = np.array([s[np.isfinite(s)][0] for s in signal if np.any(np.isfinite(s))])
             mean, std = float(first.mean()), float(np.hypot(first.std(), 0.3 * np.nanstd(signal)) + 1e-9)
         else:
-            mean, std = float(rest[i]), hidden * abs(float(rest[i])) + 1e-9
+            mean, std = float(rest[i]), 0.5 * abs(float(rest[i])) + 1e-9
             std = std if std > 1e-6 else 1.0
-        means.append(mean)
-        stds.append(std)
-        learned.append(name not in rig.start and not read)
-    return Gaussian(jnp.asarray(means, float), jnp.asarray(np.diag(np.square(stds)), float)), tuple(learned)
+        pairs.append((mean, std))
+    means, stds = np.transpose(pairs)
+    learned = tuple(name not in rig.start and name not in columns for name in system.states)
+    return Gaussian(jnp.asarray(means, float), jnp.asarray(np.diag(np.square(stds)), float)), learned
 
 
 def motion(model: StateSpaceModel, data: Dataset) -> Motion:
-    """States that the filter of a model has along the readings; where it runs away, its finite part.
-
-    A free simulation would rest where the equations do, and leave where they are unstable or wrong.
-    """
+    """States that the filter of a model has along the readings; where it runs away, its finite part."""
     path, step, _ = (np.asarray(a) for a in each(filter_path, model, jax.device_put(data)))
     valid, count = np.asarray(data.valid), len(model.system.states)
     seen = _along(model.system, path[valid], np.asarray(data.u)[valid])
@@ -161,14 +152,12 @@ def _along(system: Equations, x: Float[np.ndarray, "row state"], u: Float[np.nda
 
 
 def pace_of(rig: Rig, seen: Motion, rows: int) -> float:
-    """The declared horizon, or some time constants, as far as the recordings are long [s]; of two digits: programs are
-    shared.  That of unstable equations is the time in which errors grow e-fold.
+    """The declared horizon, or eight slowest time constants, half of which after a start it has no effect any more [s].
+
+    A third of a recording at most; the time in which errors grow e-fold where equations are unstable.  Of two digits:
+    programs are shared.
     """
-    # Time in which horizons are counted, in slowest time constants: half of that later a start has no effect any more,
-    # and errors are those of a free simulation
-    constants = 8.0
-    horizon_share = 1 / 3  # longest such time, as a share of a recording: a prediction needs a start before it
-    pace = rig.horizon or min(constants * seen.slowest, horizon_share * rows * rig.dt)
+    pace = rig.horizon or min(8.0 * seen.slowest, rows * rig.dt / 3)
     if seen.growth and not rig.horizon:
         return float(f"{max(min(pace, 1 / seen.growth), 4 * rig.dt):.2g}")
     return float(f"{max(pace, 8 * rig.dt):.2g}")
@@ -187,23 +176,17 @@ def unknown_terms(system: Equations, seen: Motion, names: tuple[str, ...]) -> tu
 
 
 def free_term(
-    system: Equations,
-    seen: Motion,
-    names: tuple[str, ...],
-    port: str,
-    signals: tuple[str, ...],
-    low: Float[np.ndarray, " axis"],
-    high: Float[np.ndarray, " axis"],
-    label: str = "",
+    system: Equations, seen: Motion, names: tuple[str, ...], port: str, signals: tuple[str, ...], low, high, label=""
 ) -> UnknownTerm:
-    """An unknown term at a port, zero: its basis is orthogonal to the slopes of all rates by the parameters."""
+    """An unknown term at a port, zero, of signals from `low` to `high`: its basis is orthogonal to the slopes of all
+    rates by the parameters.
+    """
     count = NODES[len(signals)] ** len(signals)
     plain = UnknownTerm(jnp.zeros(count), np.eye(count), low, high, channel=port, reads=signals, label=label)
     every = (*system.states, *system.inputs)
     index = np.asarray([every.index(name) for name in signals])
-    moved, slopes = _directions(
-        system, plain, names, system.ports.index(port), index, jnp.asarray(seen.x), jnp.asarray(seen.u)
-    )
+    x, u = jnp.asarray(seen.x), jnp.asarray(seen.u)
+    moved, slopes = _directions(system, plain, names, system.ports.index(port), index, x, u)
     overlap = np.einsum("rsp,rsn->pn", np.asarray(slopes), np.asarray(moved))
     size = np.linalg.norm(overlap, axis=1, keepdims=True)
     _, strength, axes = np.linalg.svd(overlap / np.where(size > 0, size, 1.0))
@@ -245,10 +228,7 @@ def _scaled(model: StateSpaceModel, seen: Motion) -> StateSpaceModel:
 
 
 def infinite_rates(rig: Rig, system: Equations, logs: Logs) -> str:
-    """Rates that are not finite in some rows: files, rows, inputs that are 0 there, and what to write; or nothing.
-
-    They are taken in the state of the start, with the inputs of every row.
-    """
+    """Rates that are not finite in some rows, in the state of the start: files, rows, inputs that are 0; or nothing."""
     u, valid = np.asarray(logs.data.u, float), np.asarray(logs.data.valid)
     x = np.asarray(start_prior(rig, system, logs.data)[0].mean)
     rates = lambda u: np.asarray(_rates(system, jnp.tile(x, (len(u), 1)), jnp.asarray(u))[0])  # noqa: E731
@@ -302,12 +282,10 @@ def build_equations(rig: Rig, system: Equations, data: Dataset):
         model = dataclasses.replace(model, start=start)
     model = _scaled(model, seen)
     rows = int(np.max(np.sum(np.asarray(data.valid), axis=1)))
-    free = tuple(n for n, d in rig.parameters.items() if d.std > 0)
-    pairs = np.array([(rig.parameters[n].mean, rig.parameters[n].std) for n in free]).reshape(-1, 2)
-    prior = ParameterPrior(free, jnp.asarray(pairs[:, 0], float), jnp.asarray(pairs[:, 1], float))
+    prior = declared_prior(rig.parameters)
     model = dataclasses.replace(model, pace=pace_of(rig, seen, rows))
     scale = np.asarray(cast(Any, model.unknown).scale)
-    terms = unknown_terms(system, seen, free)
+    terms = unknown_terms(system, seen, prior.names)
     for place, term in enumerate(terms):  # as large as what moves the port
         size = np.full(term.weights.shape, scale[system.ports.index(str(term.channel))])
         names = (*prior.names, f"{place}.weights")

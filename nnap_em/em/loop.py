@@ -74,30 +74,24 @@ class Schedule(eqx.Module):
     hold: int = eqx.field(static=True, default=2)
     """Epochs at a horizon before it grows; the first horizon lasts one more."""
 
-    @property
-    def at_first(self) -> int:
-        """Epochs at the first horizon."""
-        return self.hold + 1
-
     def horizon(self, epoch: int, longest: int) -> int:
         """Samples seen in `epoch`, counted from 0."""
         return min(longest, round(self.first * self.growth ** max(0, (epoch - 1) // self.hold)))
 
 
 def e_step(
-    model: AbstractModel,
-    data: Dataset,
-    smoother: AbstractSmoother,
-    *,
-    key: PRNGKeyArray,
-    kept: Gaussian | None = None,
+    model: AbstractModel, data: Dataset, smoother: AbstractSmoother, *, key: PRNGKeyArray, kept: Gaussian | None = None
 ) -> Posterior:
-    """Smooth every sequence of `data`, on the devices of `parallel.over`, in groups that keep below `smoother.room`.
-
-    Sequences that are too wide for it are smoothed by its second one, too, or about the path that was `kept` of that,
-    and the likelier outcome is taken.
+    """Smooth every sequence of `data`, on the devices of `parallel.over`; those that are too wide by the second
+    smoother, too, or about the path that was `kept` of that: the likelier outcome is taken.
     """
-    return _with_mixture(model, data, smoother.second(), _alone(model, data, smoother, key=key), kept)
+    first, second = _alone(model, data, smoother, key=key), smoother.second()
+    some = beyond(first, second)
+    if second is None or not some.size:
+        return first
+    wide = jax.tree.map(lambda a: np.asarray(a)[some], (data, first.state, *[kept] * (kept is not None)))
+    path, loglik = each(_likeliest_path, (model, second), wide, together=1 if kept is None else None)
+    return _replaced(first, path, loglik, some)
 
 
 def _alone(model: AbstractModel, data: Dataset, smoother: AbstractSmoother, *, key: PRNGKeyArray) -> Posterior:
@@ -108,36 +102,16 @@ def _alone(model: AbstractModel, data: Dataset, smoother: AbstractSmoother, *, k
     return outcomes[0] if len(outcomes) == 1 else each(_likeliest, None, outcomes)
 
 
-def _with_mixture(
-    model: AbstractModel,
-    data: Dataset,
-    second: MixtureSmoother | None,
-    first: Posterior,
-    kept: Gaussian | None = None,
-) -> Posterior:
-    """`first`, with the likeliest path of the second smoother, or that about `kept`, where a sequence is wide."""
-    some = beyond(first, second)
-    if second is None or not some.size:
-        return first
-    wide = jax.tree.map(lambda a: np.asarray(a)[some], (data, first.state, *[kept] * (kept is not None)))
-    path, loglik = each(_likeliest_path, (model, second), wide, together=1 if kept is None else None)
-    return _replaced(first, path, loglik, some)
-
-
 def beyond(first: Posterior, second: MixtureSmoother | None) -> Int[np.ndarray, " some"]:
-    """Sequences that are wider than the first smoother can follow, so that the second one is used.
-
-    None where that is part of a larger program, which has no numbers to decide by.
-    """
+    """Sequences that are too wide for the first smoother; none within a larger program, which has no numbers."""
     if second is None or first.width is None or isinstance(first.width, Tracer):
         return np.zeros(0, int)
     return np.flatnonzero(~(np.asarray(first.width) <= second.wide))
 
 
 def _likeliest_path(common, one) -> tuple[Posterior, Float[Array, ""]]:
-    """The likeliest path of the second smoother, and the likelihood of that of the first, each linearised about itself.
-
-    A relinearisation may diverge, so that the path it began from is compared, too.
+    """The likeliest path of the second smoother, and the likelihood of that of the first, each linearised about itself:
+    a relinearisation may diverge.
     """
     (model, second), (seq, first, *kept) = common, one
     paths, before = second.paths(model, prepare(model, seq), first, *kept)
@@ -147,14 +121,14 @@ def _likeliest_path(common, one) -> tuple[Posterior, Float[Array, ""]]:
 def _replaced(first: Posterior, second: Posterior, loglik: Float[Array, " some"], index) -> Posterior:
     """`second` at the places `index` of `first`, where it is likelier than these are by their `loglik`."""
     known = np.flatnonzero(np.asarray(second.loglik) > np.nan_to_num(np.asarray(loglik), nan=-np.inf, neginf=-np.inf))
-    first, second = jax.tree.map(np.array, (first, second._replace(width=first.width)))
 
-    def put(a: np.ndarray, b: np.ndarray) -> jax.Array:
-        a[index[known]] = b[known]
-        return jax.device_put(a)
+    def put(a: jax.Array, b: jax.Array) -> jax.Array:
+        out = np.array(a)
+        out[index[known]] = np.asarray(b)[known]
+        return jax.device_put(out)
 
-    width = first.width
-    return jax.tree.map(put, first._replace(width=None), second._replace(width=None))._replace(width=width)
+    moved = jax.tree.map(put, first._replace(width=None), second._replace(width=None))
+    return moved._replace(width=first.width)
 
 
 def _likeliest(_, tries: list[Posterior]) -> Posterior:
@@ -182,9 +156,8 @@ def em_step(
     """One E-step and one M-step: the next model, the log-likelihoods of this one, the effective sample sizes, and the
     smoothed paths.
 
-    Each is compiled by itself: what does not depend on the structure of the model is compiled once for all. While the
-    horizon is `growing`, no sequence is smoothed a second time: the noise is still so large that all are wide.
-    `step` keeps the result in the journal of a command, from which it goes on after a stop; elsewhere it does nothing.
+    While the horizon is `growing`, no sequence is smoothed a second time: the noise is still so large that all are
+    wide. `step` keeps the result in the journal of a command, from which it goes on after a stop.
     """
     posterior = _alone(model, data, smoother, key=key) if growing else e_step(model, data, smoother, key=key, kept=kept)
     model, info = m_step(model, posterior, data)
@@ -202,8 +175,8 @@ def later_state(model: AbstractModel, m_step: AbstractMStep, *, key: PRNGKeyArra
 
 
 SCHEDULE = Schedule()
-WIDENED, SMOOTHED, SEARCHED = range(1 << 30, (1 << 30) + 3)
-"""Numbers folded into the key of a fit for draws after it, of its covariance, states, a later search."""
+WIDENED, SMOOTHED = 1 << 30, (1 << 30) + 1
+"""Numbers folded into the key of a fit for draws after it, of its covariance and states."""
 EPOCHS = 40
 """Epochs of a fit at most."""
 DIVERGED = -1e6
@@ -227,9 +200,8 @@ def fit(
     """EM from `state` until `epochs` are done or the likelihood rests.
 
     It rests when, with the whole data in sight, the mean log-likelihood of a sequence moves by less than `tolerance`
-    nats twice running, or when less than a fifth of a step would be tried, after two refusals. Before the last stage of
-    the M-step the next one then begins, from the best model. Horizons are counted from shortly before the first
-    motion of each sequence.
+    nats twice running, or when less than a fifth of a step would be tried. Before the last stage of the M-step the next
+    one then begins, from the best model. Horizons are counted from shortly before the first motion of each sequence.
     Raises FitError when no sequence can be followed by the first model at a horizon; later ones are refused.
     """
     longest, still = int(np.max(np.sum(np.asarray(data.valid), axis=1))), onset(np.asarray(data.y))
@@ -285,18 +257,15 @@ def _released(state: EMState) -> EMState:
 
 
 def unsettled(state: EMState, schedule: Schedule, longest: int) -> float:
-    """Rise of the log-likelihood in the last two epochs of a fit [nat a sequence]; 0 for one that is at rest.
-
-    Infinite where fewer than three epochs saw whole sequences. A sampled likelihood rises by more than it ever fell.
+    """Rise of the log-likelihood in the last two epochs of a fit [nat a sequence]; 0 for one that is at rest, infinite
+    where fewer than three epochs saw whole sequences. A sampled likelihood rises by more than it ever fell.
     """
     epochs = range(state.epoch - len(state.loglik), state.epoch)  # a fit begun from another starts at 1
     every = [(schedule.horizon(epoch, longest), v) for epoch, v in zip(epochs, state.loglik, strict=True)]
     whole = [v for seen, v in every if seen == longest and v > DIVERGED]  # a refused step is none
     if len(whole) < 3:
         return math.inf
-    # Least rise of the log-likelihood over two epochs by which EM is not at rest [nat a sequence]
-    least_rise = 2 * REST
-    least = least_rise if math.isinf(state.ess) else max(least_rise, float(np.max(-np.diff(whole))))
+    least = 2 * REST if math.isinf(state.ess) else max(2 * REST, float(np.max(-np.diff(whole))))
     rise = float(max(whole[-2:]) - max(whole[:-2]))
     return rise if rise >= least else 0.0
 
@@ -304,9 +273,8 @@ def unsettled(state: EMState, schedule: Schedule, longest: int) -> float:
 def _rise(state: EMState, path: Gaussian, data: Dataset, rule, used: Bool[np.ndarray, " seq"]) -> float:
     """Rise of the log-likelihood from the best model to the one that was tried, beyond what is known [nat a sequence].
 
-    Both are linearised about the `path` from which the step was made. The likelihood of the best one changes when it is
-    linearised about that path, too, and is known no better: on a real arm with steep friction than 50 nat. -inf where a
-    sequence was lost, or for samples.
+    Both are linearised about the `path` from which the step was made, which changes the likelihood of the best one: it
+    is known no better, on a real arm with steep friction than 50 nat. -inf where a sequence was lost, or for samples.
     """
     if np.any(np.isfinite(state.top) & ~used) or math.isfinite(state.ess):
         return -math.inf
@@ -320,9 +288,8 @@ def _judge(
 ) -> EMState:
     """Accept the model that was tried, or go back to the best one and try a shorter way from there.
 
-    Half a nat a sequence is allowed: likelihoods of linearised and of sampled smoothers are not exact.  What falls
-    along its own path may rise along the `same` path.  A sequence that was left out under the best model does not
-    count; one that diverges under the new model counts against it.
+    Half a nat a sequence is allowed, since likelihoods are not exact.  What falls along its own path may rise along the
+    `same` path.  A sequence left out under the best model does not count, one that diverges under the new one does.
     """
     loglik = np.nan_to_num(loglik, nan=DIVERGED, neginf=DIVERGED)
     mean = float(np.mean(loglik[used]))
@@ -336,11 +303,11 @@ def _judge(
     return state._replace(epoch=state.epoch + 1, model=model, loglik=np.append(state.loglik, mean))
 
 
-def _settle_noise(model: AbstractModel, data: Dataset, smoother, key: PRNGKeyArray, scales=(1.0, 0.3, 0.1, 0.03, 0.01)):
-    """`model` with its process noise scaled by the likeliest of `scales`: the error of its motion is unknown."""
+def _settle_noise(model: AbstractModel, data: Dataset, smoother, key: PRNGKeyArray) -> AbstractModel:
+    """`model` with its process noise scaled to the likeliest size: the error of its motion is unknown."""
+    scales, logliks = (1.0, 0.3, 0.1, 0.03, 0.01), []
     trials = [eqx.tree_at(lambda m: m.log_q, model, model.log_q + 2 * math.log(scale)) for scale in scales]
-    logliks = []
-    for trial in trials:  # the step that would follow does not count
+    for trial in trials:
         posterior = _alone(trial, data, smoother, key=key)
         used = np.asarray(not_diverged(posterior, data))
         logliks.append(float(np.mean(np.asarray(posterior.loglik)[used])) if used.any() else -math.inf)

@@ -1,13 +1,11 @@
 """M-step of the hybrid model: EM's gradient, scaled by the information that the data really hold.
 
-The smoother gives the score by Fisher's identity, the expectation of the complete-data score.  EM would divide
-it by the complete-data information and crawl where the missing part dominates; here it is divided by the observed
-information of the model linearised about the smoothed path, the sum of J'J of whitened innovations
-[Louis 1982, J. R. Stat. Soc. B 44(2); Lange 1995, J. R. Stat. Soc. B 57(2)].
+The smoother gives the score by Fisher's identity.  EM would divide it by the complete-data information and crawl where
+the missing part dominates; here it is divided by the observed information of the model linearised about the smoothed
+path, the sum of J'J of whitened innovations [Louis 1982, J. R. Stat. Soc. B 44(2); Lange 1995, ibid. 57(2)].
 
-The friction network is tabulated at velocity nodes: torques at the nodes and the uncertain physical parameters form the
-vector phi in which the likelihood is quadratic; the network is then fitted to that quadratic form by
-Levenberg-Marquardt.
+Torques at velocity nodes and uncertain physical parameters form the vector phi, in which the likelihood is quadratic;
+the network is fitted to that quadratic form by Levenberg-Marquardt.
 """
 
 import math
@@ -28,9 +26,8 @@ from ..numerics.gaussian import Gaussian
 from ..numerics.parallel import each, few_sizes, on_default_device
 from ..smoother.kalman import Cubature, Tangent, kalman_filter
 from ..smoother.posterior import Posterior
-from .local import locals_along, readings_along
 from .prior import ParameterPrior
-from .quadratic import Local, Quadratic, quadratic
+from .quadratic import Local, Quadratic, locals_along, quadratic, readings_at
 from .weights import Known, Weights, bounds
 
 
@@ -91,10 +88,7 @@ class AbstractMStep(eqx.Module):
 
 
 def not_diverged(posterior: Posterior, data: Dataset) -> Bool[Array | np.ndarray, " seq"]:
-    """Sequences that have not diverged: log-likelihood per reading not far below the median of all.
-
-    By NumPy where it is no part of a larger program: no program for every number of sequences.
-    """
+    """Sequences that have not diverged: log-likelihood per reading not far below the median of all."""
     loglik, y, valid = posterior.loglik, data.y, data.valid
     xp: Any = jnp if any(isinstance(a, Tracer) for a in (loglik, y, valid)) else np
     loglik, y, valid = map(xp.asarray, (loglik, y, valid))
@@ -171,11 +165,8 @@ def _advance(rule: "ScoringMStep", core: Core, terms: Quadratic, first: Gaussian
 
 
 RESTING_STEP = 0.1
-"""Standard deviation of the change of a node's torque in one M-step on logs that rest, in the torque of the drive.
-
-There only the slope of the map is determined, and a step by it alone would make friction a peak of many times its size,
-which no later step leaves. No fixed point moves.
-"""
+"""Standard deviation of the change of a node's torque in one M-step on logs that rest, in the torque of the drive; by
+the slope of the map, which alone is determined there, friction would become a peak that no later step leaves."""
 RESTING_OFFSET = 0.1
 """`ScoringMStep.coarse` of logs that rest [standard deviations of an offset of friction]."""
 RELEASES = (1.0, 10.0, 100.0)
@@ -196,16 +187,11 @@ class ScoringMStep(AbstractMStep):
     max_log_step: Float[Array, ""] = eqx.field(default=1.5, converter=jnp.asarray)
     """Largest change of a log variance in one step."""
     ratio_precision: Float[Array, ""] = eqx.field(default=30.0, converter=jnp.asarray)
-    """Precision with which the ratios of the joints' process noises are held to those of the first model.
-
-    Without this prior, model error is attributed to the unmeasured joint: its noise grows until its states are free.
-    """
+    """Precision with which the ratios of the joints' process noises are held to those of the first model; without it,
+    the noise of an unmeasured joint grows until its states are free."""
     linearise: Tangent | Cubature = Cubature()
     symmetry_std: Float[Array, ""] = eqx.field(default=6.4, converter=jnp.asarray)
-    """`Weights.symmetry_std`: loose, but while the horizon grows.
-
-    With few samples near zero velocity, EM over a short horizon fits a spurious peak there and cannot leave it.
-    """
+    """`Weights.symmetry_std`: loose, but while the horizon grows, over which few samples are near zero velocity."""
     departure: Float[Array, ""] = eqx.field(default=math.inf, converter=jnp.asarray)
     """`Weights.departure`: free."""
     coarse: Float[Array, ""] = eqx.field(default=math.inf, converter=jnp.asarray)
@@ -217,9 +203,7 @@ class ScoringMStep(AbstractMStep):
     least: Float[Array, " bounded"] = eqx.field(default_factory=lambda: jnp.zeros(0))
     """`Weights.least`, of the declared parameters."""
     quiet: Float[Array, " obs"] | None = None
-    """Smallest log variances of the readings, by the logs alone; None: any. Process noise of a hidden state may stand
-    for that of its reading.
-    """
+    """Smallest log variances of the readings, by the logs alone; None: any."""
     known: Known | None = None
     """`Weights.known`."""
 
@@ -247,7 +231,7 @@ class ScoringMStep(AbstractMStep):
     def __call__(self, model, posterior: Posterior, data: Dataset) -> tuple[StateSpaceModel, MStepInfo]:
         """One step of Fisher scoring."""
         linear = locals_along(model, self.prior, posterior.state, data, self.linearise)
-        read = readings_along(model, posterior, linear.seq)
+        read = each(readings_at, model, (posterior, linear.seq))
         core = self.core(model)
         core, hessian, used = self.advance(core, linear, posterior, read, not_diverged(posterior, data))
         return self.whole(model, core), MStepInfo(hessian, used)
@@ -267,20 +251,13 @@ class ScoringMStep(AbstractMStep):
         return eqx.tree_at(lambda m: (m.log_q, m.log_r, m.start), fitted, core[2:])
 
     def advance(
-        self,
-        core: Core,
-        linear: Local,
-        posterior: Posterior,
-        read: Float[Array, "seq time node obs"],
-        used: Bool[Array | np.ndarray, " seq"],
+        self, core: Core, linear: Local, posterior: Posterior, read: Float[Array, "seq time node obs"], used
     ) -> tuple[Core, Float[Array, "phi phi"], Bool[np.ndarray, " seq"]]:
-        """The step itself: one program for models of every structure; parameters are nameless here.
+        """The step itself, the posterior precision where it began, and which of the sequences `used` could be.
 
-        With it the posterior precision where it began, and which of the sequences `used` could be.
+        One program for models of every structure: parameters are nameless, and padded to a multiple of eight.
         """
-        # The number of parameters is padded to a multiple of this, and to one at least: one program for most models
-        multiple = 8
-        pad = multiple * max(1, -(-self.prior.size // multiple)) - self.prior.size
+        pad = 8 * max(1, -(-self.prior.size // 8)) - self.prior.size
         prior, w, (of_state, of_reading), first = _widened(self.prior, core.w, linear, posterior.state, pad)
         rule = eqx.tree_at(lambda r: (r.prior, r.least), self, (prior, bounds(self.least, prior.size)))
         linear = linear._replace(by_parameter=of_state, reading_by_parameter=of_reading)  # pyrefly: ignore[bad-argument-type]
@@ -315,9 +292,7 @@ class ScoringMStep(AbstractMStep):
         return model.log_q + step[:n], model.log_r + step[n:]
 
     def _hold(self, dof: int) -> Float[Array, "state state"]:
-        """Prior precision of the log process noises: kicks act on rates, and reach angles over one step; on all states
-        of equations.
-        """
+        """Prior precision of the log process noises: kicks act on rates and reach angles over one step."""
         if not dof:
             return self.ratio_precision * (jnp.eye(count := len(self.learn_start)) - 1 / count)
         rate = jnp.eye(dof)
@@ -331,7 +306,5 @@ class ScoringMStep(AbstractMStep):
         count = jnp.maximum(jnp.sum(used), 1).astype(start.mean.dtype)
         mean = jnp.where(learn, jnp.sum(first.mean, axis=0) / count, start.mean)
         square = jnp.where(used[:, None], (first.mean - mean[None]) ** 2, 0.0)
-        variance = (jnp.sum(square + jnp.diagonal(first.cov, axis1=1, axis2=2), axis=0) + jnp.diag(start.cov)) / (
-            count + 1
-        )
-        return Gaussian(mean, jnp.diag(jnp.where(learn, variance, jnp.diag(start.cov))))
+        total = jnp.sum(square + jnp.diagonal(first.cov, axis1=1, axis2=2), axis=0) + jnp.diag(start.cov)
+        return Gaussian(mean, jnp.diag(jnp.where(learn, total / (count + 1), jnp.diag(start.cov))))

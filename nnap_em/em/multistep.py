@@ -20,12 +20,10 @@ from ..model.state_space import StateSpaceModel
 from ..numerics.gaussian import Gaussian
 from ..numerics.parallel import each
 from ..smoother.kalman import CUBATURE, kalman_filter
-from .local import locals_along
 from .mstep import ScoringMStep
 from .prior import ParameterPrior
-from .quadratic import Local, friction_columns, reading_columns
-from .shape import friction_prior
-from .weights import Weights
+from .quadratic import Local, friction_columns, locals_along, reading_columns
+from .weights import Weights, friction_prior
 
 HORIZONS = (0.25, 0.5)
 """Horizons [s] at which errors are compared."""
@@ -39,6 +37,8 @@ SLOPE_WIDTH = 0.1
 """Spread over which slopes are taken, in rms speeds: as wide as predictions err."""
 HUBER_STD = 2.0
 """Errors of more robust standard deviations weigh less."""
+FARTHEST = 30.0
+"""Errors of more standard deviations count as this many: a simulation that runs away has no size."""
 
 
 class Columns(NamedTuple):
@@ -69,19 +69,6 @@ class OpenLoop(NamedTuple):
     """Derivatives by friction nodes, by parameters, then by the extra columns."""
     overlap: Float[np.ndarray, " horizon"]
     """Number of predictions that cover one moment."""
-
-
-def grid_of(dt: float, rows: int, horizons: tuple[float, ...] = HORIZONS, pace: float = 1.0) -> Grid:
-    """Starts and horizons on logs of `rows` samples, counted in `pace` [s]; where logs are short, horizons are too."""
-    dt = dt / pace
-    stride = max(1, round(SPACING / dt))
-    longest = max(1, rows // 3 // stride)
-    return Grid(stride, tuple(stride * min(longest, max(1, round(h / dt / stride))) for h in horizons))
-
-
-def starts(model: StateSpaceModel, data: Dataset, horizons: tuple[float, ...] = HORIZONS) -> Int[np.ndarray, " start"]:
-    """Rows of all sequences at which a prediction begins."""
-    return grid_along(model, data, horizons).starts(data.t.shape[1])
 
 
 def channels(model: StateSpaceModel) -> tuple[int, ...]:
@@ -130,8 +117,8 @@ def open_loop(
     *,
     share: int = 0,
 ) -> OpenLoop:
-    """Multi-step errors, or `error` where it is known, and their derivatives; `extra` gives columns by sequences, of
-    which a device works on at most `share` at once.
+    """Multi-step errors, or `error` if known, and their derivatives; `extra` gives columns by sequences, of which a
+    device works on at most `share` at once.
     """
     (rows, obs), ports = along.data.y.shape[1:], len(along.model.system.ports)
     grid, see, out = grid_along(along.model, along.data, horizons), channels(along.model), []
@@ -162,9 +149,7 @@ def errors(
 
 
 def _single_enough(along: Followed) -> bool:
-    """True where numbers of 32 bits tell readings apart to a hundredth of their noise, times to one of a row, and
-    hidden coordinates to some 1e-4: predictions take a third of the time in them.
-    """
+    """True where 32 bits hold readings to a hundredth of their noise, times to one of a row, coordinates to 1e-4."""
     largest = lambda a, axis: np.nanmax(np.abs(np.asarray(a)), axis=axis, initial=0.0)  # noqa: E731
     fine, spacing = 0.01, 2.0**-24  # some hundred roundings on the way add up to a tenth
     noise, dof = np.exp(0.5 * np.asarray(along.model.log_r)), len(along.model.system.coordinates)
@@ -179,8 +164,11 @@ def _single(tree: Any) -> Any:
 
 
 def grid_along(model: StateSpaceModel, data: Dataset, horizons: tuple[float, ...] = HORIZONS) -> Grid:
-    """Starts and horizons on logs for predictions of a model."""
-    return grid_of(model.dt, int(np.median(np.sum(np.asarray(data.valid), axis=1))), horizons, model.pace)
+    """Starts and horizons, in the pace of the model [s], as far as logs are long, for its predictions."""
+    dt, rows = model.dt / model.pace, int(np.median(np.sum(np.asarray(data.valid), axis=1)))
+    stride = max(1, round(SPACING / dt))
+    longest = max(1, rows // 3 // stride)
+    return Grid(stride, tuple(stride * min(longest, max(1, round(h / dt / stride))) for h in horizons))
 
 
 def _wide(model: StateSpaceModel, prior: ParameterPrior, path: Gaussian, data: Dataset) -> Local:
@@ -188,8 +176,7 @@ def _wide(model: StateSpaceModel, prior: ParameterPrior, path: Gaussian, data: D
     dof, states = len(model.system.coordinates), len(model.system.states)
     mean = np.asarray(path.mean)
     rates = np.where(np.asarray(data.valid)[..., None], mean[..., dof:states], np.nan)
-    with warnings.catch_warnings():  # of sequences that are nowhere known
-        warnings.simplefilter("ignore", RuntimeWarning)
+    with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # of sequences that are nowhere known
         if dof:
             rms = np.sqrt(np.nanmean(rates**2, axis=(0, 1)))
             spread = [SLOPE_WIDTH * HORIZONS[0] * rms, SLOPE_WIDTH * rms]
@@ -270,14 +257,11 @@ def _sensitivities(common, one) -> Float[Array, "start horizon obs column"]:
     return jax.lax.map(ahead, (known[starts], jnp.asarray(starts)))
 
 
-# --- how large
-
-
 def robust_scale(error: Float[np.ndarray, "seq start horizon obs"]) -> Float[np.ndarray, "seq 1 horizon obs"]:
     """Standard deviation of every sequence at every horizon, by medians; 1 where there is no error.
 
-    It is the geometric mean of a sequence's own and that of all: with that of all, a few recordings with large errors
-    decide alone; with its own, one with hardly any motion counts as much as any.
+    The geometric mean of a sequence's own and that of all: by that of all, a few recordings with large errors decide
+    alone; by its own, one with hardly any motion counts as much as any.
     """
     if not error.size:
         return np.ones((error.shape[0], 1, *error.shape[2:]))
@@ -288,17 +272,14 @@ def robust_scale(error: Float[np.ndarray, "seq start horizon obs"]) -> Float[np.
     return 1.4826 * np.sqrt(whole * single) + 1e-12
 
 
-def huber(error, scale):
-    """Squared error in scales, beyond HUBER of them a straight line [Huber 1964]; what runs away counts as 30."""
-    size = np.minimum(np.abs(error) / scale, 30.0)
-    return np.where(size < HUBER_STD, size**2, HUBER_STD * (2 * size - HUBER_STD))
+def huber(error, scale, bend: float = HUBER_STD):
+    """Squared error in scales, beyond `bend` of them a straight line [Huber 1964], or as `FARTHEST`."""
+    size = np.minimum(np.abs(error) / scale, FARTHEST)
+    return np.where(size < bend, size**2, bend * (2 * size - bend))
 
 
 def ratio(before, after, used: Bool[np.ndarray, " seq"]) -> float:
-    """Squared error of one model over that of another on the same starts, the mean over the horizons.
-
-    Outliers weigh less.
-    """
+    """Robust squared error of one model over that of another on the same starts, the mean over the horizons."""
     before, after = before[used], after[used]
     known, scale = np.isfinite(before), robust_scale(before)
     if not known.any():
@@ -309,6 +290,12 @@ def ratio(before, after, used: Bool[np.ndarray, " seq"]) -> float:
     return float(np.mean(second[first > 0] / first[first > 0])) if (first > 0).any() else 1.0
 
 
+def cleaned(predictions: OpenLoop, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Columns and errors, 0 where the weight is."""
+    columns = np.where(weight[..., None] > 0, predictions.columns, 0.0).astype(float)
+    return columns, np.where(weight > 0, predictions.error, 0.0)
+
+
 def weighed(predictions: OpenLoop, used: Bool[np.ndarray, " seq"]) -> Float[np.ndarray, "seq start horizon obs"]:
     """Robust weights: one over the variance of a sequence, horizon and channel, less for outliers, 0 for none."""
     error = np.where(used[:, None, None, None], predictions.error, np.nan)
@@ -317,9 +304,6 @@ def weighed(predictions: OpenLoop, used: Bool[np.ndarray, " seq"]) -> Float[np.n
         size = np.minimum(1.0, HUBER_STD * scale / np.abs(error))
     sound = np.isfinite(error) & np.isfinite(predictions.columns).all(axis=-1)
     return np.where(sound, size / scale**2 / predictions.overlap[:, None], 0.0)
-
-
-# --- a fit to them
 
 
 GAUSS_NEWTON_STEPS = 3
@@ -340,8 +324,8 @@ def finish(
     """`model` after Gauss-Newton steps on the multi-step errors of the sequences `used`, each halved until it predicts
     better over all horizons at which a model is judged.
 
-    Friction, parameters and effects move, where it is `shaped` friction under the prior of its shape; noise and start
-    stay.  [Bohlin 2006, "Practical Grey-box Process Identification", for prediction-error fits over several horizons]
+    Friction, parameters and effects move, `shaped` friction under the prior of its shape; noise and start stay.
+    [Bohlin 2006, "Practical Grey-box Process Identification", for prediction-error fits over several horizons]
     """
     best = followed(model, m_step.prior, path, data)
     error = errors(best, JUDGED)

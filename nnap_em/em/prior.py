@@ -1,13 +1,17 @@
 """Physical parameters that are estimated, of the machine and of the effects: one vector, with the declared prior."""
 
+from collections.abc import Mapping
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from ..data.rig import Declared
+
 
 class ParameterPrior(eqx.Module):
-    """Physical parameters to be estimated, with the declared prior; estimated in its standard deviations."""
+    """Physical parameters, estimated in standard deviations of the declared prior."""
 
     names: tuple[str, ...] = eqx.field(static=True)
     """Names of the system, "m2" or "forearm.mass", of a servo, "goal.kp", or of an effect by its place, "0.k"."""
@@ -53,3 +57,10 @@ class ParameterPrior(eqx.Module):
     def size(self) -> int:
         """Number of estimated values."""
         return self.mean.shape[0]
+
+
+def declared_prior(parameters: Mapping[str, Declared]) -> ParameterPrior:
+    """That of the parameters that are uncertain."""
+    free = {name: one for name, one in parameters.items() if one.std > 0}
+    mean, std = (jnp.asarray([getattr(one, field) for one in free.values()], float) for field in ("mean", "std"))
+    return ParameterPrior(tuple(free), mean, std)

@@ -11,16 +11,7 @@ from ..data.dataset import Dataset
 from ..model.state_space import StateSpaceModel
 from ..numerics.gaussian import Gaussian
 from .mstep import ScoringMStep
-from .multistep import HORIZONS, errors, followed, huber, open_loop, weighed
-
-
-class Levels(NamedTuple):
-    """Errors that a fit has on its own recordings, each left out in turn."""
-
-    scale: Float[np.ndarray, "horizon obs"]
-    """Root mean square over the recordings [rad, or m]; errors beyond twice the typical one weigh less."""
-    level: Float[np.ndarray, " recording"]
-    """`level` of every recording."""
+from .multistep import cleaned, followed, huber, open_loop, weighed
 
 
 def left_out(
@@ -33,8 +24,7 @@ def left_out(
     weights = m_step.weights(model)
     along = open_loop(followed(model, m_step.prior, path, data), weights)
     weight = weighed(along, used)
-    columns = np.where(weight[..., None] > 0, along.columns, 0.0).astype(float)
-    error = np.where(weight > 0, along.error, 0.0)
+    columns, error = cleaned(along, weight)
     prior = np.asarray(weights.prior_precision(model.unknown))
     rows = len(error), -1
     moved = deleted(columns.reshape(*rows, columns.shape[-1]), weight.reshape(rows), error.reshape(rows), prior)
@@ -56,12 +46,6 @@ def deleted(
     return error + np.einsum("srp,sp->sr", columns, away)
 
 
-def levels(error: Float[np.ndarray, "seq start horizon obs"]) -> Levels:
-    """Scale and levels of the errors of recordings left out."""
-    size = np.nanmedian(np.abs(error), axis=(0, 1)) * 1.4826 + 1e-12
-    return Levels(size, level(error, size))
-
-
 def level(
     error: Float[np.ndarray, "seq start horizon obs"], scale: Float[np.ndarray, "horizon obs"]
 ) -> Float[np.ndarray, " seq"]:
@@ -70,13 +54,6 @@ def level(
     square = np.where(known, huber(np.where(known, error, 0.0), scale[None, None]), 0.0).sum(axis=(1, 2, 3))
     count = known.sum(axis=(1, 2, 3))
     return np.where(count > 0, 0.5 * np.log(square / np.maximum(count, 1) + 1e-12), np.nan)
-
-
-def errors_of(
-    model: StateSpaceModel, m_step: ScoringMStep, path: Gaussian, data: Dataset
-) -> Float[np.ndarray, "seq start horizon obs"]:
-    """Errors of recordings that are new to a fit."""
-    return errors(followed(model, m_step.prior, path, data), HORIZONS)
 
 
 class Risen(NamedTuple):

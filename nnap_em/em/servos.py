@@ -32,9 +32,8 @@ def build_servos(rig: Rig) -> tuple[Servo, ...]:
 
 
 def steps_of_sample(system: AbstractSystem, servos: tuple[Servo, ...], data: Dataset, dt: float) -> float:
-    """Integration steps that a sample needs, by the fastest eigenvalue of the machine under its servos.
-
-    Of M a = -K q - D v at rest in some poses, K and D the slopes of the torques at the largest gains in the logs.
+    """Integration steps that a sample needs, by the fastest eigenvalue of M a = -K q - D v at rest in some poses, K and
+    D the slopes of the servos' torques at the largest gains in the logs.
     """
     if not servos:
         return 0.0
@@ -45,8 +44,7 @@ def steps_of_sample(system: AbstractSystem, servos: tuple[Servo, ...], data: Dat
     q = jnp.asarray(np.random.default_rng(0).uniform(-np.pi, np.pi, (32, dof)), float)
     slopes = np.asarray(_servo_slopes(system, tuple(unlimited(servo) for servo in servos), q))
     state = np.concatenate([np.concatenate([np.zeros((32, dof, dof)), np.tile(np.eye(dof), (32, 1, 1))], 2), slopes], 1)
-    # Integration step as a share of the fastest time of a servo at its joint, of which the classical Runge-Kutta method
-    # bears 2.8
+    # half the fastest time of a servo at its joint, of which the classical Runge-Kutta method bears 2.8
     return float(np.max(np.abs(np.linalg.eigvals(state)))) * dt / 0.5
 
 
@@ -63,15 +61,11 @@ def _servo_slopes(system: AbstractSystem, servos, q: Float[Array, "pose dof"]) -
 
 
 def torque_along(
-    servo: Servo,
-    u: Float[np.ndarray, "seq time"],
-    q: Float[np.ndarray, "seq time"],
-    scale: Float[np.ndarray, "seq time column"],
-    dt: float,
+    servo: Servo, u: Float[np.ndarray, "seq time"], q: Float[np.ndarray, "seq time"], scale: np.ndarray, dt: float
 ) -> Float[np.ndarray, "seq time"]:
     """Torque of a servo at logged commands and positions of the motor's side [N m, or N]; NaN where none is read.
 
-    Rates are differences over `LAG` rows before and after, so that noise of the readings adds little.
+    With gains by the columns `scale`; rates are differences over `LAG` rows before and after.
     """
     ahead = np.concatenate([q[:, LAG:], np.repeat(q[:, -1:], LAG, axis=1)], axis=1)
     behind = np.concatenate([np.repeat(q[:, :1], LAG, axis=1), q[:, :-LAG]], axis=1)

@@ -2,9 +2,8 @@
 
     e(z, s) = y_{k+h} - g(x_{k+h}(z, s)),   x_k = m_k + W s the start of a window
 
-The derivatives go through the simulation, unlike those of `multistep`, which are linear about a smoothed path: a model
-of a few equations may be wrong by as much as its signals move, and its parameters move by as much as they are large.
-Starts are estimated with the parameters: those of a filter are wrong where its model is.
+The derivatives go through the simulation, not about a smoothed path: a model of a few equations may be wrong by as much
+as its signals move. Starts are estimated with the parameters: those of a filter are wrong where its model is.
 [Ljung 1999, "System Identification", 2nd ed., chapter 7, for output errors; More 1978, "The Levenberg-Marquardt
 algorithm", LNM 630; Bock 1983 for many starts]
 """
@@ -25,12 +24,11 @@ from ..model.base import prepare
 from ..model.state_space import StateSpaceModel
 from ..numerics.parallel import each
 from ..smoother.kalman import TANGENT, ekf
+from .multistep import FARTHEST, huber
 from .prior import ParameterPrior
 
 HUBER = 3.0
 """Errors of more standard deviations weigh less: of Gaussian ones three in a thousand."""
-FARTHEST = 30.0
-"""Errors of more standard deviations count as this many: a simulation that runs away has no size."""
 
 
 class Windows(eqx.Module):
@@ -51,12 +49,10 @@ class Windows(eqx.Module):
 def windows(model: StateSpaceModel, data: Dataset) -> Windows:
     """Windows of the errors of a model: each sequence in equal parts."""
     rows, pace = int(np.max(np.sum(np.asarray(data.valid), axis=1))), model.pace / model.dt
-    length = 2.0  # length of a simulation, in the pace of the model: a reading is one pace from its start on average
-    count = max(1, round(rows / (length * pace)))
-    # Time after which 2 % of an error of a start are left, in the pace of the model: four slowest time constants
-    settles = 0.5
-    fine = 128  # errors in a pace at most, sixteen in a slowest time constant: closer ones are the same but for noise
-    return Windows(count, rows // count, max(1, round(pace / fine)), round(settles * pace))
+    count = max(1, round(rows / (2.0 * pace)))  # simulations of two paces: a reading is one from its start on average
+    # 128 errors in a pace at most, sixteen in a slowest time constant; of an error of a start, half a pace later, after
+    # four slowest time constants, 2 % are left
+    return Windows(count, rows // count, max(1, round(pace / 128)), round(0.5 * pace))
 
 
 Errors = Float[np.ndarray, "seq window place obs"]
@@ -124,8 +120,7 @@ def together(
     numbers = [eqx.filter((m, p, p.read(m)), eqx.is_array) for m, p in zip(models, priors, strict=True)]
     static = eqx.filter((models[0], priors[0], jnp.zeros(0)), eqx.is_array, inverse=True)
     out = []
-    # Numbers of models whose errors are computed at once, a program for each; copies of the last model fill one up
-    groups = (1, 4, 16, 64)
+    groups = (1, 4, 16, 64)  # models at once, a program for each number; copies of the last model fill one up
     for first in range(0, len(models), groups[-1]):
         some, begun = numbers[first : first + groups[-1]], list(starts[first : first + groups[-1]])
         size = next(size for size in groups if size >= len(some))
@@ -133,12 +128,10 @@ def together(
         stacked = jax.tree.map(lambda *a: np.repeat(np.stack(list(map(np.asarray, a))), count, axis=0), *filled)
         tiled = jax.tree.map(lambda a, size=size: np.concatenate([np.asarray(a)] * size), (tuple(data), begin.mean))
         begun = np.concatenate([*begun, *begun[-1:] * (size - len(begun))])
-        error, columns, by_start = each(
-            _errors, (static, at, begin.width), (stacked, Dataset(*tiled[0]), tiled[1], begun)
-        )
+        batch = stacked, Dataset(*tiled[0]), tiled[1], begun
+        out_of = begun, *each(_errors, (static, at, begin.width), batch)
         for i, (_, _, z) in enumerate(some):
-            part = slice(i * count, (i + 1) * count)
-            values = (np.asarray(a[part]) for a in (begun, error, columns, by_start))
+            values = (np.asarray(a[i * count : (i + 1) * count]) for a in out_of)
             out.append(Simulated(models[first + i], priors[first + i], np.asarray(z), *values))
     return out
 
@@ -174,13 +167,8 @@ def scale_of(of: Simulated) -> Scale:
 
 
 def independent(of: Simulated) -> float:
-    """Number of independent errors.
-
-        n / (1 + 2 sum_k rho_k),   rho_k the correlation of errors k places apart, as long as the sum of two neighbours
-        is above zero
-
-    Errors of a wrong model go on for some time constants, those of a right one are the noise of the readings.
-    [Geyer 1992, Statistical Science 7(4), 473, for the end of the sum]
+    """Number of independent errors: n / (1 + 2 sum_k rho_k), rho_k the correlation of errors k places apart, as long as
+    the sum of two neighbours is above zero [Geyer 1992, Statistical Science 7(4), 473].
     """
     unit, total = np.ma.masked_invalid(of.error) / scale_of(of), 1.0
     places = unit.shape[2]
@@ -193,9 +181,8 @@ def independent(of: Simulated) -> float:
 
 
 def cost(error: Errors, scale: Scale, counts: Counts) -> float:
-    """Squared errors in scales; linear beyond `HUBER` [Huber 1964]."""
-    size = np.where(np.isfinite(error), np.minimum(np.abs(error) / scale, FARTHEST), FARTHEST)
-    return float(np.sum(np.where(counts, np.where(size < HUBER, size**2, HUBER * (2 * size - HUBER)), 0.0)))
+    """Squared errors in scales; linear beyond `HUBER`, those that are no number as `FARTHEST`."""
+    return float(np.sum(np.where(counts, huber(np.where(np.isfinite(error), error, np.inf), scale, HUBER), 0.0)))
 
 
 def log_posterior(of: Simulated, scale: Scale, counts: Counts) -> float:

@@ -17,9 +17,9 @@ from ..model.state_space import StateSpaceModel
 from ..numerics.gaussian import Gaussian
 from ..numerics.parallel import each
 from ..smoother.kalman import kalman_filter, rts
-from .local import locals_along
 from .mstep import ScoringMStep
-from .multistep import Columns, OpenLoop, followed, open_loop, sensitivities, weighed
+from .multistep import Columns, OpenLoop, cleaned, followed, open_loop, sensitivities, weighed
+from .quadratic import locals_along
 from .weights import Weights
 
 
@@ -88,19 +88,10 @@ def widened(
 
 
 def of_states(
-    model: StateSpaceModel,
-    m_step: ScoringMStep,
-    path: Gaussian,
-    data: Dataset,
-    phi: Float[Array, "draw phi"],
-    force: float,
-    *,
-    key: PRNGKeyArray,
+    model: StateSpaceModel, m_step: ScoringMStep, path: Gaussian, data: Dataset, phi, force: float, *, key: PRNGKeyArray
 ) -> Float[Array, "seq time state state"]:
-    """Covariance that smoothed states have beyond the smoother's own: by friction and parameters, of which `phi` are
-    deviations drawn from the posterior, and by unmodelled forces of size `force`.
-
-    The smoother is linear about its path: the mean square of what each draw moves there.
+    """Covariance that smoothed states have beyond the smoother's own: by friction and parameters, of which `phi` (draw,
+    phi) are deviations drawn from the posterior, and by unmodelled forces of size `force`, linear about its path.
     """
     key_columns, key_kicks = jax.random.split(key)
     weights = m_step.weights(model)
@@ -127,17 +118,10 @@ def _moved(common, one) -> Float[Array, "time state state"]:
 
 
 def discrepancy_columns(
-    model: StateSpaceModel,
-    weights: Weights,
-    path: Gaussian,
-    data: Dataset,
-    used: Bool[np.ndarray, " seq"],
-    *,
-    key: PRNGKeyArray,
+    model: StateSpaceModel, weights: Weights, path: Gaussian, data: Dataset, used: np.ndarray, *, key: PRNGKeyArray
 ) -> Columns:
-    """Random smooth forces of state and input at every joint, as large as friction that is not the same both ways.
-
-    Draws of a Gaussian process whose length is a standard deviation of each signal.
+    """Random smooth forces of state and input at every joint, as large as friction that is not the same both ways, by
+    the sequences `used`: draws of a Gaussian process whose length is a standard deviation of each signal.
     """
     dof, states = len(model.system.ports), len(model.system.states)
     known = np.asarray(data.valid) & used[:, None]
@@ -193,8 +177,7 @@ def _rows(
     predictions: OpenLoop, weight: Float[np.ndarray, "seq start horizon obs"], phi: int
 ) -> tuple[Errors, Float[np.ndarray, "seq start phi"]]:
     """The errors in a row, and the score of every start."""
-    columns = np.where(weight[..., None] > 0, predictions.columns, 0.0).astype(float)
-    error = np.where(weight > 0, predictions.error, 0.0)
+    columns, error = cleaned(predictions, weight)
     scores = np.einsum("skhoc,skho->skc", columns[..., :phi], weight * error)
     flat = columns.reshape(-1, columns.shape[-1])
     count = float(np.sum((weight > 0) / predictions.overlap[:, None]))

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from .prior import ParameterPrior
@@ -67,17 +68,12 @@ class Weights(eqx.Module):
         cut = w.shape[0] - self.prior.size
         return jnp.concatenate([jnp.full(cut, self.ridge, w.dtype), jnp.ones_like(w[cut:])])
 
-    def middle(self) -> Float[Array, " weight"]:
-        """Prior mean of the weights."""
-        return jnp.concatenate([self.centre, jnp.zeros(self.prior.size, self.centre.dtype)])
-
     @eqx.filter_jit
     def symmetry(self, unknown, w: Float[Array, " weight"]) -> Float[Array, "phi phi"]:
         """Prior precision of phi: friction opposes motion alike in both directions, unless the data contradict.
 
-        The even part is an offset and a part of every node, which vanishes with the odd part of the map at `w`: the
-        friction of each direction is zero at rest, and rises over the velocities of the machine. Where the prior is
-        coarse, what departs from viscous, Coulomb and constant friction is small.
+        The even part is an offset and a part of every node, which vanishes with the odd part of the map at `w`. Where
+        the prior is coarse, what departs from viscous, Coulomb and constant friction is small.
         """
         if self.known is not None:
             return self.known.terms(self.nodes.size + self.prior.size)[0]
@@ -105,19 +101,16 @@ class Weights(eqx.Module):
 
     @eqx.filter_jit
     def _of_maps(self, unknown) -> Float[Array, "phi phi"]:
-        """Prior precision of the torques at the nodes.
-
-        In function space and wider than the network's own prior, in which friction that rises steeply near rest is ten
-        standard deviations away. Matern's covariance of order 5/2 over the nodes. [Rasmussen & Williams 2006, eq. 4.17;
-        Khan, Immer, Abedi & Korzepa 2019, NeurIPS, for function space]
+        """Prior precision of the torques at the nodes, wider than the network's own prior, in which friction that rises
+        steeply near rest is ten standard deviations away: Matern's covariance of order 5/2 over the nodes.
+        [Rasmussen & Williams 2006, eq. 4.17; Khan, Immer, Abedi & Korzepa 2019, NeurIPS, for function space]
         """
         count, dtype = self.nodes.shape[1], self.centre.dtype
         w = unknown.weights()
         torque = self.phi(unknown, w).reshape(self.nodes.shape)
         variance = jnp.mean(torque**2, axis=1) + self.asymmetry[: len(self.nodes)] ** 2
-        # Nodes over which the maps of the prior bend, of 41 a factor of 7 in velocity: on slides, pendulums and
-        # acrobots with Stribeck friction 97 to 100 % of the truth near rest is then within two standard deviations;
-        # with 9, of a slide 88 %
+        # Nodes over which the maps bend: 97 to 100 % of Stribeck friction near rest is then within two standard
+        # deviations; with 9, of a slide 88 %
         place = jnp.arange(count, dtype=dtype) / 6.0
         apart = math.sqrt(5.0) * jnp.abs(place[:, None] - place[None])
         grain = 1e-3  # standard deviation of a torque beside that, as a share of its own: what the curve itself may err
@@ -131,24 +124,18 @@ class Weights(eqx.Module):
         return jnp.moveaxis(jax.vmap(at)(self.nodes.T)[:, unknown.of_joint()], 0, 1)
 
     def fit(
-        self,
-        unknown,
-        w0: Float[Array, " weight"],
-        score: Float[Array, " phi"],
-        information: Float[Array, "phi phi"],
-        iterations: int,
+        self, unknown, w0: Float[Array, " weight"], score: Float[Array, " phi"], information, iterations: int
     ) -> Float[Array, " weight"]:
         """Levenberg-Marquardt on the quadratic log-likelihood with the priors [Nocedal & Wright 2006, sec. 10.3].
 
         A parameter at its smallest value stays there while the likelihood falls inwards [Bertsekas 1982, SIAM J.
-        Control Optim. 20(2)].
-        A step solves (J'IJ + D) step = gradient with I = root' root by the Woodbury identity: there are fewer nodes
-        than weights, and J has a block for every joint.
+        Control Optim. 20(2)]. A step solves (J'IJ + D) step = gradient, I = root' root, by the Woodbury identity: there
+        are fewer nodes than weights, and J has a block for every joint.
         """
         shape, size, cut = self.nodes.shape, self.nodes.size, w0.shape[0] - self.prior.size
         phi0 = self.phi(unknown, w0)
         precision = self.precision(w0)
-        middle = self.middle()
+        middle = jnp.concatenate([self.centre, jnp.zeros(self.prior.size, self.centre.dtype)])
         symmetry = self.symmetry(unknown, w0)
         score = score - symmetry @ phi0
         if self.known is not None:
@@ -214,8 +201,8 @@ AT_REST = 0.03
 COULOMB = 0.01
 """Share of the largest velocity over which the Coulomb friction of a coarse map changes its sign."""
 VISCOUS = 0.1
-"""Precision of viscous friction in that of what is none of the three: the first, slow rows determine none, and a slope
-read from them would make the fast sequences diverge (0.02 to 0.2 keep them, 0 loses one of six)."""
+"""Precision of viscous friction in that of what is none of the three: slow rows determine none, and a slope read from
+them would make fast sequences diverge (0.02 to 0.2 keep them, 0 loses one of six)."""
 
 
 def _beside(nodes: Float[Array, " count"]) -> Float[Array, "count count"]:
@@ -225,3 +212,31 @@ def _beside(nodes: Float[Array, " count"]) -> Float[Array, "count count"]:
     base = jnp.linalg.qr(kinds)[0]
     free = jnp.asarray([1.0, 1.0, 1.0 - VISCOUS], nodes.dtype)[None, : base.shape[1]]
     return jnp.eye(nodes.shape[0], dtype=nodes.dtype) - (base * free) @ base.T
+
+
+def friction_prior(model, weights: Weights) -> tuple[np.ndarray, np.ndarray]:
+    """Precision and pull of phi: the total map free in the span of known laws, the rest small, parameters as declared.
+
+    A prior on its size would bind strong Coulomb friction; one on its change would leave half an effect inside the map.
+    """
+    nodes, size = np.asarray(weights.nodes), weights.nodes.size + weights.prior.size
+    value = np.asarray(weights.phi(model.unknown, weights.read(model)))
+    if weights.known is not None:
+        precision, goal = weights.prior_precision(model.unknown), weights.known.terms(size)[1]
+        return np.asarray(precision), np.asarray(precision @ value - goal)
+    precision, pull = np.zeros((size, size)), np.zeros(size)
+    count = nodes.shape[1]
+    rest = 0.1  # rms of a map beside the span of known laws, over that of the map; 0.03 to 0.3 gave the same answers
+    knees = (0.003, 0.01, 0.03, 0.1, 0.3)  # of the Coulomb and Stribeck laws in that span, over the largest speed
+    for j, v in enumerate(nodes):
+        joint = slice(j * count, (j + 1) * count)
+        top = np.abs(v).max()
+        laws = np.stack([v / top, *(np.tanh(v / (r * top)) for r in knees)], axis=1)
+        others = np.linalg.svd(laws)[0][:, laws.shape[1] :]  # what no sum of known laws can be
+        beside = others @ others.T / (rest * np.sqrt(np.mean(value[joint] ** 2)) + 1e-12) ** 2
+        precision[joint, joint] = beside + (1e-9 * np.trace(beside) / count + 1e-12) * np.eye(count)
+        pull[joint] = beside @ value[joint]
+    parameters = slice(nodes.size, size)
+    precision[parameters, parameters] = np.eye(weights.prior.size)
+    pull[parameters] = value[parameters]
+    return precision, pull

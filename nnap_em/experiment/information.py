@@ -9,9 +9,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..data.dataset import Dataset
-from ..em.local import local
 from ..em.prior import ParameterPrior
-from ..em.quadratic import Local, friction_columns, reading_columns, whitened_sensitivities
+from ..em.quadratic import Local, friction_columns, local, reading_columns, whitened_sensitivities
 from ..fit.identify import Identified
 from ..model.base import prepare
 from ..model.state_space import StateSpaceModel

@@ -32,8 +32,8 @@ from ..em.loop import (
 )
 from ..em.mstep import ScoringMStep, not_diverged
 from ..em.multistep import JUDGED, LEAST_FALL, errors, finish, followed, ratio
-from ..em.noise import white_readings
 from ..em.prior import ParameterPrior
+from ..em.readings import white_readings
 from ..em.scale import holding, not_identifiable
 from ..em.stated import widened
 from ..em.weights import Weights

@@ -24,19 +24,12 @@ class GaussianSmoother(AbstractSmoother):
     window: int = eqx.field(static=True, default=60)
     """Samples over which the hypotheses compete."""
     iterations: int = eqx.field(static=True, default=1)
-    """Relinearisations about the smoothed path: Gauss-Newton steps on the path.  Every epoch of EM begins anew with the
-    first pass; the mixture, which compares the likelihoods of paths, takes four."""
+    """Relinearisations about the smoothed path: Gauss-Newton steps on the path."""
     inflations: tuple[float, ...] = eqx.field(static=True, default=(1.0,))
-    """Process noise of the first pass over that of the model: a looser filter follows where a tight one diverges.
-
-    It decides only where the second pass linearises; that pass and its likelihood have the noise of the model."""
+    """Process noise of the first pass, which decides only where the second one linearises, over that of the model: a
+    looser filter follows where a tight one diverges."""
     branching: bool = eqx.field(static=True, default=True)
     """False: one Gaussian only, also where an angle that is not read is wide."""
-
-    @property
-    def bytes_per_row(self) -> int:
-        """Memory [B] that a row takes."""
-        return 8192  # measured for four states in 64 bits (docs/results/throughput.md)
 
     def tolerant(self) -> "GaussianSmoother":
         """The smoother with looser first passes."""
@@ -51,25 +44,19 @@ class GaussianSmoother(AbstractSmoother):
         once = dataclasses.replace(self, inflations=(1.0,), branching=False)  # one program, with `second` or without
         return [_Loosened(once, jnp.asarray(math.log(factor), float)) for factor in self.inflations]
 
-    def path(self, model, seq: Prepared) -> tuple[Filtered, Smoothed]:
-        """Filtered and smoothed states of the last iteration."""
-        return self.tracked(model, seq)[:2]
-
     def tracked(self, model, seq: Prepared) -> tuple[Filtered, Smoothed, Float[Array, ""]]:
         """Filtered and smoothed states of the last iteration, and the width of the first pass."""
-        start = self.likeliest(model, seq)
+        start = self.bank.likeliest(model, seq, self.linearise, self.window)
         looser = jnp.log(jnp.asarray(self.inflations, seq.y.dtype))
-        tracks = jax.vmap(lambda looser: self.follow(model, seq, start, looser))(looser)
-        best = likeliest(tracks[0].loglik)
-        filtered, smoothed = jax.tree.map(lambda a: a[best], tracks[:2])
-        return filtered, smoothed, tracks[2][0]
+        filtered, smoothed, width = jax.vmap(lambda looser: self.follow(model, seq, start, looser))(looser)
+        best = likeliest(filtered.loglik)
+        return *jax.tree.map(lambda a: a[best], (filtered, smoothed)), width[0]
 
     def follow(
         self, model, seq: Prepared, start: Gaussian, looser: Float[Array, ""]
     ) -> tuple[Filtered, Smoothed, Float[Array, ""]]:
-        """Smoothing from one start, the log of the process noise of the first pass `looser` than that of the model.
-
-        With the largest standard deviation of an angle in the first pass [rad].
+        """Smoothing from one start, the log of the process noise of the first pass `looser` than that of the model, and
+        `width` of that pass.
         """
         filtered = ekf(eqx.tree_at(lambda m: m.log_q, model, model.log_q + looser), start, seq, self.linearise)
 
@@ -81,9 +68,8 @@ class GaussianSmoother(AbstractSmoother):
         return *smoothed, self.width(filtered, seq)
 
     def width(self, filtered: Filtered, seq: Prepared) -> Float[Array, ""]:
-        """Largest standard deviation of the angles given the readings so far [rad]; 0 where they need no mixture.
-
-        Rows in which the bank still decides do not count, but for those before the first reading.
+        """Largest standard deviation of the angles given the readings so far [rad], 0 where they need no mixture; rows
+        in which the bank still decides do not count, but for those before the first reading.
         """
         if not self.bank.angles:
             return jnp.zeros_like(filtered.loglik)
@@ -93,15 +79,9 @@ class GaussianSmoother(AbstractSmoother):
         counts = unread | (jnp.arange(variance.shape[0]) >= decided)
         return jnp.sqrt(jnp.max(jnp.where(counts, variance, 0.0)))
 
-    def likeliest(self, model, seq: Prepared) -> Gaussian:
-        """The start of the bank that the first samples make likeliest."""
-        starts, score = self.bank.scored(model, seq, self.linearise, self.window)
-        best = likeliest(score)
-        return jax.tree.map(lambda a: a[best], starts)
-
     def __call__(self, model: AbstractModel, seq: Prepared, *, key: PRNGKeyArray | None = None) -> Posterior:
         """Smooth one sequence; it draws nothing."""
-        return _posterior(*self.tracked(model, seq))
+        return linear_posterior(*self.tracked(model, seq))
 
 
 class _Loosened(AbstractSmoother):
@@ -110,19 +90,10 @@ class _Loosened(AbstractSmoother):
     smoother: GaussianSmoother
     looser: Float[Array, ""]
 
-    @property
-    def bytes_per_row(self) -> int:
-        """Memory [B] that a row takes."""
-        return self.smoother.bytes_per_row
-
     def __call__(self, model: AbstractModel, seq: Prepared, *, key: PRNGKeyArray | None = None) -> Posterior:
-        """Smooth one sequence; it draws nothing."""
-        start = self.smoother.likeliest(model, seq)
-        return _posterior(*self.smoother.follow(model, seq, start, self.looser))
-
-
-def _posterior(filtered: Filtered, smoothed: Smoothed, width: Float[Array, ""]) -> Posterior:
-    return linear_posterior(filtered, smoothed)._replace(width=width)
+        one = self.smoother
+        start = one.bank.likeliest(model, seq, one.linearise, one.window)
+        return linear_posterior(*one.follow(model, seq, start, self.looser))
 
 
 def ExtendedKalmanSmoother(bank: StartBank, **options) -> GaussianSmoother:

@@ -6,6 +6,7 @@ Measurement noise is diagonal, so readings are absorbed one at a time; a missing
 
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -62,24 +63,27 @@ class Tangent(eqx.Module):
 
     def __call__(self, model, about: Gaussian, u: Any) -> Affine:
         """One step about the mean."""
-
-        def both(x):
-            y = model.transition(x, u)
-            return y, y
-
-        matrix, value = jax.jacfwd(both, has_aux=True)(about.mean)
+        matrix, value = _slope(model.transition, about.mean, u)
         return Affine(matrix, value - product(matrix, about.mean), jnp.zeros_like(matrix))
+
+
+def _slope(function: Callable, x: Float[Array, " state"], u: Any):
+    """Jacobian and value at x."""
+
+    def both(x):
+        y = function(x, u)
+        return y, y
+
+    return jax.jacfwd(both, has_aux=True)(x)
 
 
 TANGENT = Tangent()
 
 
 class Cubature(eqx.Module):
-    """The transition linearised over a whole Gaussian, by 2 n cubature points: the best affine map in mean square.
-
-    It sees a friction kink as wide as the state is uncertain, and keeps the covariance that an affine map cannot
-    explain. [Arasaratnam & Haykin 2009; Garcia-Fernandez, Svensson & Sarkka 2017, "Iterated posterior linearization
-    smoother"]
+    """The transition linearised over a whole Gaussian, by 2 n cubature points: the best affine map in mean square, and
+    the covariance that it cannot explain. [Arasaratnam & Haykin 2009; Garcia-Fernandez, Svensson & Sarkka 2017,
+    "Iterated posterior linearization smoother"]
     """
 
     def __call__(self, model, about: Gaussian, u: Any) -> Affine:
@@ -103,12 +107,7 @@ CUBATURE = Cubature()
 
 def linear_reading(model, x: Float[Array, " state"], u: Any) -> Reading:
     """The emission linearised at x."""
-
-    def both(x):
-        y = model.emission(x, u)
-        return y, y
-
-    rows, value = jax.jacfwd(both, has_aux=True)(x)
+    rows, value = _slope(model.emission, x, u)
     return Reading(rows, value - product(rows, x))
 
 
@@ -150,10 +149,8 @@ def moved(state: Gaussian, affine: Affine, q: Float[Array, "state state"], activ
 
 
 def _filter(log_q, log_r, start: Gaussian, seq: Prepared, arguments, affine_at, reading_at) -> Filtered:
-    """Kalman recursion.
-
-    `affine_at(state, arguments)` gives the transition that follows a filtered state, `reading_at(mean, arguments)` the
-    emission at a predicted mean; `arguments` are those of its row.
+    """Kalman recursion: `affine_at(state, arguments)` gives the transition that follows a filtered state,
+    `reading_at(mean, arguments)` the emission at a predicted mean; `arguments` are those of its row.
     """
     q, r = jnp.diag(jnp.exp(log_q)), jnp.exp(log_r)
 
@@ -164,29 +161,16 @@ def _filter(log_q, log_r, start: Gaussian, seq: Prepared, arguments, affine_at, 
         affine, following = moved(state, affine_at(state, arguments), q, active)
         return following, (state, predicted, whitened, log_variance, gain, affine, reading)
 
-    _, (state, predicted, whitened, log_variance, gain, affine, reading) = jax.lax.scan(
-        step, start, (seq.y, seq.observed, seq.active, arguments)
-    )
+    _, out = jax.lax.scan(step, start, (seq.y, seq.observed, seq.active, arguments))
+    _, _, whitened, log_variance, *_ = out
     count = jnp.sum(seq.observed).astype(whitened.dtype)
-    loglik = -0.5 * (jnp.sum(whitened**2 + log_variance) + count * math.log(2 * math.pi))
-    return Filtered(state, predicted, whitened, log_variance, gain, affine, reading, loglik)
+    return Filtered(*out, -0.5 * (jnp.sum(whitened**2 + log_variance) + count * math.log(2 * math.pi)))
 
 
 def ekf(model, start: Gaussian, seq: Prepared, linearise: Callable = TANGENT) -> Filtered:
-    """Extended Kalman filter: linearised about its own filtered states, by tangents or by cubature.
-
-    Entries of y that are not `observed` may hold anything finite.  The state rests over steps that are not `active`
-    (padding); the last affine map leads out of the data.
-    """
-    return _filter(
-        model.log_q,
-        model.log_r,
-        start,
-        seq,
-        seq.inputs,
-        lambda state, u: linearise(model, state, u),
-        lambda mean, u: linear_reading(model, mean, u),
-    )
+    """Extended Kalman filter: linearised about its own filtered states; the last affine map leads out of the data."""
+    affine_at, reading_at = partial(linearise, model), partial(linear_reading, model)
+    return _filter(model.log_q, model.log_r, start, seq, seq.inputs, affine_at, reading_at)
 
 
 def kalman_filter(
@@ -198,21 +182,18 @@ def kalman_filter(
     seq: Prepared,
 ) -> Filtered:
     """Kalman filter of the time-varying affine model, as linearised about a path beforehand."""
-    return _filter(
-        log_q,
-        log_r,
-        start,
-        seq,
-        (affine, reading),
-        lambda state, arguments: arguments[0],
-        lambda mean, arguments: arguments[1],
-    )
+    return _filter(log_q, log_r, start, seq, (affine, reading), lambda state, both: both[0], lambda mean, both: both[1])
+
+
+def linearised(model, about: Gaussian, seq: Prepared, linearise: Callable) -> tuple[Affine, Reading]:
+    """All steps and emissions of `model`, linearised about a path."""
+    reading = jax.vmap(partial(linear_reading, model))(about.mean, seq.inputs)
+    return rows(partial(linearise, model), about, seq.inputs), reading
 
 
 def relinearised(model, about: Gaussian, seq: Prepared, linearise: Callable) -> Filtered:
     """Filter of `model` with all steps linearised about a path at once [Bell 1994]."""
-    affine = rows(lambda state, u: linearise(model, state, u), about, seq.inputs)
-    reading = jax.vmap(lambda x, u: linear_reading(model, x, u))(about.mean, seq.inputs)
+    affine, reading = linearised(model, about, seq, linearise)
     return kalman_filter(model.log_q, model.log_r, model.start, affine, reading, seq)
 
 
@@ -235,18 +216,16 @@ def rts(filtered: Filtered) -> Smoothed:
     return Smoothed(Gaussian(mean, cov), gain)
 
 
-def linear_posterior(filtered: Filtered, smoothed: Smoothed) -> Posterior:
+def linear_posterior(filtered: Filtered, smoothed: Smoothed, width: Float[Array, ""] | None = None) -> Posterior:
     """The posterior of a model that was linearised about a path."""
     mean, cov = smoothed.state
     affine = jax.tree.map(lambda a: a[:-1], filtered.affine)
-    nodes = jax.vmap(_pair_nodes)(mean[:-1], cov[:-1], smoothed.gain, mean[1:], cov[1:], affine)
+    prev, following, kick = jax.vmap(_pair_nodes)(mean[:-1], cov[:-1], smoothed.gain, mean[1:], cov[1:], affine)
     endless = jnp.full_like(filtered.loglik, jnp.inf)
-    return Posterior(smoothed.state, *nodes, affine.noise, filtered.loglik, endless)
+    return Posterior(smoothed.state, prev, following, kick, affine.noise, filtered.loglik, endless, width)
 
 
-def _pair_nodes(
-    mean, cov, gain, mean_next, cov_next, affine: Affine
-) -> tuple[Float[Array, "node state"], Float[Array, "node state"], Float[Array, "node state"]]:
+def _pair_nodes(mean, cov, gain, mean_next, cov_next, affine: Affine) -> list[Float[Array, "node state"]]:
     """Cubature nodes of the Gaussian p(x_k, x_{k+1} | y) and their kicks.
 
     x_{k+1} = m_{k+1} + L z, x_k = m_k + G L z + C w with L L' the covariance of x_{k+1}, C C' that of x_k beyond it.
@@ -261,5 +240,4 @@ def _pair_nodes(
     after = jnp.concatenate([later, jnp.zeros_like(alone)])
     kick = mean_next - product(affine.matrix, mean) - affine.offset
     centres_and_axes = (mean, before), (mean_next, after), (kick, after - product(before, affine.matrix.T))
-    prev, following, kicks = (jnp.concatenate([at[None] + axes, at[None] - axes]) for at, axes in centres_and_axes)
-    return prev, following, kicks
+    return [jnp.concatenate([at[None] + axes, at[None] - axes]) for at, axes in centres_and_axes]

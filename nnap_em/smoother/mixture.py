@@ -1,9 +1,8 @@
 """Gaussian-sum filter and smoother: more than one place at a time for an angle that is not read.
 
-A component that has become wide along such an angle is split in three. Where more are carried on than there is room
-for, the two whose merging changes the mixture least become one. Each remembers the component from which it came, so
-that a Rauch-Tung-Striebel pass follows every final component back to the start; all steps are then relinearised about
-its path, and the likeliest path is the result.
+A component that has become wide along such an angle is split in three; where there is no room for more, the two whose
+merging changes the mixture least become one. A Rauch-Tung-Striebel pass follows every final component back to the
+start; all steps are then relinearised about its path, and the likeliest path is the result.
 [Alspach & Sorenson 1972, IEEE Trans. Autom. Control 17(4), for the filter; Runnalls 2007, IEEE Trans. Aerosp. Electron.
 Syst. 43(3), for merging]
 """
@@ -20,26 +19,14 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from ..model.base import AbstractModel, Prepared
 from ..numerics.gaussian import Gaussian, cholesky, lower
-from .kalman import (
-    Cubature,
-    Filtered,
-    Smoothed,
-    Tangent,
-    absorbed,
-    linear_posterior,
-    linear_reading,
-    moved,
-    relinearised,
-    rts,
-)
+from .kalman import Cubature, Filtered, Tangent, absorbed, linear_posterior, linear_reading, moved, relinearised, rts
 from .posterior import AbstractSmoother, Posterior, likeliest
 
 WIDE_STD = 0.2
 """Standard deviation of an unread angle beyond which one Gaussian does not describe it [rad].
 
-Three narrower ones of 0.13 rad, about that of a hypothesis of the start, do. On four real double pendulums the filter's
-exceeds 0.4 rad in every recording in which the arm passed the upright position and could be followed on two branches,
-and is below 0.13 rad in all others.
+On four real double pendulums the filter's exceeds 0.4 rad in every recording in which the arm passed the upright
+position and could be followed on two branches, and is below 0.13 rad in all others.
 """
 NARROW = 2 / 3
 """Standard deviation of each part over that of the component that is split."""
@@ -70,10 +57,7 @@ class Tree(NamedTuple):
 
 
 def split(before: Components, angles: tuple[int, ...], wide: float) -> Components:
-    """Two more places: the likeliest of the components that are wide along an angle becomes three.
-
-    They lie along the regression of the whole state on that one.
-    """
+    """Two more places: the likeliest component that is wide along an angle becomes three, on its regression on that."""
     (mean, cov), log_weight, source = before
     variance = jnp.diagonal(cov, axis1=1, axis2=2)[:, jnp.asarray(angles)]
     able = (jnp.max(variance, axis=1) > wide**2) & jnp.isfinite(log_weight)
@@ -82,10 +66,9 @@ def split(before: Components, angles: tuple[int, ...], wide: float) -> Component
     direction = cov[which, :, along] / jnp.sqrt(cov[which, along, along])
     narrow = cov[which] - (1 - NARROW**2) * direction[:, None] * direction[None, :]
     shift, side = DISTANCE * direction, 1 / 6
+    centres = mean[which][None] + jnp.stack([0 * shift, -shift, shift])
     parts = Components(
-        Gaussian(
-            mean[which][None] + jnp.stack([0 * shift, -shift, shift]), jnp.broadcast_to(narrow, (3, *narrow.shape))
-        ),
+        Gaussian(centres, jnp.broadcast_to(narrow, (3, *narrow.shape))),
         log_weight[which] + jnp.log(jnp.asarray([1 - 2 * side, side, side])),
         jnp.broadcast_to(source[which], 3),
     )
@@ -135,18 +118,9 @@ def merged(before: Components) -> Components:
 
 
 def mixture_filter(
-    model,
-    start: Gaussian,
-    log_weight: Float[Array, " component"],
-    seq: Prepared,
-    linearise: Callable,
-    angles: tuple[int, ...],
-    wide: float = WIDE_STD,
+    model, start: Gaussian, log_weight: Float[Array, " component"], seq: Prepared, linearise: Callable, angles
 ) -> Tree:
-    """Gaussian-sum filter with as many places as `start` has components; at most one is split in a row.
-
-    Readings that are not `observed` may hold anything finite; the state rests over steps that are not `active`.
-    """
+    """Gaussian-sum filter with as many places as `start` has components, of which one at most is split in a row."""
     q, r, places = jnp.diag(jnp.exp(model.log_q)), jnp.exp(model.log_r), jnp.arange(len(log_weight))
 
     def step(carry, slices):
@@ -156,15 +130,14 @@ def mixture_filter(
         state, whitened, log_variance, gain = jax.vmap(lambda x, c: absorbed(x, c, r, y, observed))(predicted, reading)
         log_weight = log_weight - 0.5 * jnp.sum(whitened**2 + log_variance, axis=1)
         log_weight = jnp.where(jnp.isfinite(log_weight), log_weight, -jnp.inf)
-        here = merged(merged(split(Components(state, log_weight, places), angles, wide)))
+        here = merged(merged(split(Components(state, log_weight, places), angles, WIDE_STD)))
         affine = jax.vmap(lambda x: linearise(model, x, u))(here.state)
         affine, following = jax.vmap(lambda x, a: moved(x, a, q, active))(here.state, affine)
         row = Filtered(here.state, predicted, whitened, log_variance, gain, affine, reading, here.log_weight)
         return (following, here.log_weight), (row, here.source)
 
-    (_, log_weight), (rows, source) = jax.lax.scan(
-        step, (start, log_weight), (seq.y, seq.observed, seq.active, seq.inputs)
-    )
+    slices = seq.y, seq.observed, seq.active, seq.inputs
+    (_, log_weight), (rows, source) = jax.lax.scan(step, (start, log_weight), slices)
     return Tree(rows, source, log_weight)
 
 
@@ -207,15 +180,13 @@ class MixtureSmoother(AbstractSmoother):
     def paths(
         self, model: AbstractModel, seq: Prepared, first: Gaussian | None = None, kept: Gaussian | None = None
     ) -> tuple[Posterior, Float[Array, " path"]]:
-        """The posterior along the ancestors of every final component, or about `kept` alone, and about `first`.
-
-        The likelihood is that of the model linearised about the path itself, and -inf where there is none. With it
-        the likelihoods about the paths that these began from.
+        """The posterior along the ancestors of every final component, or about `kept` alone, and about `first`, its
+        likelihood -inf where there is none; with it the likelihoods about the paths that these began from.
         """
         if kept is None:
             start = jax.tree.map(lambda a: jnp.broadcast_to(a, (self.components, *a.shape)), model.start)
             log_weight = jnp.where(jnp.arange(self.components) == 0, 0.0, -jnp.inf)
-            tree = mixture_filter(model, start, log_weight, seq, self.linearise, self.angles, self.wide)
+            tree = mixture_filter(model, start, log_weight, seq, self.linearise, self.angles)
             ends = jnp.arange(self.components)
             paths = jax.vmap(lambda last: rts(branch(tree, last)).state)(ends)
             followed = jnp.isfinite(tree.log_weight)
@@ -230,7 +201,7 @@ class MixtureSmoother(AbstractSmoother):
     def _about(self, model: AbstractModel, seq: Prepared, path: Gaussian) -> tuple[Posterior, Float[Array, ""]]:
         """The posterior relinearised about a path, and the likelihood of the model linearised about that itself."""
 
-        def once(path: Gaussian) -> tuple[Filtered, Smoothed]:
+        def once(path: Gaussian):
             filtered = relinearised(model, path, seq, self.linearise)
             return filtered, rts(filtered)
 

@@ -15,9 +15,8 @@ from ..numerics.gaussian import Gaussian
 class Posterior(NamedTuple):
     """The smoothing distribution: its marginals, and equal-weight nodes of p(x_k, x_{k+1} | y) for every step.
 
-    An M-step takes expectations of functions that are not linear (friction at the velocity of a step) under the
-    distribution of neighbouring states.  Means over nodes serve paths of particles and cubature points of a Gaussian
-    alike; the lag-one covariance is that of `prev` and `next`.
+    Nodes are paths of particles or cubature points of a Gaussian: an M-step takes means of nonlinear functions over
+    them; the lag-one covariance is that of `prev` and `next`.
     """
 
     state: Gaussian
@@ -43,18 +42,16 @@ class AbstractSmoother(eqx.Module):
     """Memory [B] that smoothing may take on a device beside its results."""
 
     @property
-    @abstractmethod
     def bytes_per_row(self) -> int:
-        """Memory [B] that a row of a sequence takes while it is smoothed."""
+        """Memory [B] that a row of a sequence takes: of four states in 64 bits (docs/results/throughput.md)."""
+        return 8192
 
     @abstractmethod
     def __call__(self, model: AbstractModel, seq: Prepared, *, key: PRNGKeyArray) -> Posterior:
         """Smooth `seq` under `model`; deterministic smoothers leave `key` alone."""
 
     def tolerant(self) -> "AbstractSmoother":
-        """The same for a finished model, where no next epoch recovers a diverged sequence: slower and more patient,
-        if it can.
-        """
+        """The same for a finished model, where no next epoch recovers a diverged sequence: slower, if it can be."""
         return self
 
     def second(self) -> Any:

@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 from ..model.base import Prepared
 from ..numerics.gaussian import Gaussian
 from .kalman import ekf
+from .posterior import likeliest
 
 
 class StartBank(eqx.Module):
@@ -51,12 +52,11 @@ class StartBank(eqx.Module):
         cov = start.cov * jnp.outer(bank.shrink, bank.shrink)
         return Gaussian(means, jnp.tile(cov[None], (means.shape[0], 1, 1))), -0.5 * jnp.sum(self.offsets**2, axis=-1)
 
-    def scored(
-        self, model, seq: Prepared, linearise: Callable, window: int
-    ) -> tuple[Gaussian, Float[Array, " hypothesis"]]:
-        """The hypotheses, and the log of prior and likelihood of each over the first `window` samples."""
+    def likeliest(self, model, seq: Prepared, linearise: Callable, window: int) -> Gaussian:
+        """The hypothesis that the prior and the first `window` samples make likeliest."""
         starts, log_weight = self.hypotheses(model.start)
-        if log_weight.shape[0] == 1:
-            return starts, log_weight
-        head = jax.tree.map(lambda a: a[:window], seq)
-        return starts, jax.vmap(lambda start: ekf(model, start, head, linearise).loglik)(starts) + log_weight
+        if log_weight.shape[0] > 1:
+            head = jax.tree.map(lambda a: a[:window], seq)
+            log_weight = jax.vmap(lambda start: ekf(model, start, head, linearise).loglik)(starts) + log_weight
+        best = likeliest(log_weight)
+        return jax.tree.map(lambda a: a[best], starts)

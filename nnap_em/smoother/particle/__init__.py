@@ -2,8 +2,7 @@
 
 from .backward import ExactBackward, ffbs
 from .filter import particle_filter
-from .potentials import Potentials
-from .proposals import Bootstrap, Guided, Lookahead
+from .potentials import Bootstrap, Guided, Lookahead, Potentials
 from .smoother import ParticleSmoother
 
 __all__ = [

@@ -10,8 +10,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from ...numerics.elementary import exp2
 from ...numerics.random import uniforms
-from .filter import ParticleHistory
-from .resampling import systematic, upto
+from .filter import ParticleHistory, systematic, upto
 
 
 class Trajectories(NamedTuple):
@@ -23,20 +22,15 @@ class Trajectories(NamedTuple):
 
 
 class ExactBackward(eqx.Module):
-    """Draws the particle that a trajectory passes through at k, given where it is at k + 1.
-
-    Forward filtering, backward sampling: all particles are weighed for each path [Godsill, Doucet & West 2004].
+    """Draws the particle that a trajectory passes through at k, given where it is at k + 1: all particles are weighed
+    for each path [Godsill, Doucet & West 2004, forward filtering, backward sampling].
     """
 
     block: int = eqx.field(static=True, default=32)
     """Particles per block of the two-level inverse distribution function."""
 
     def __call__(
-        self,
-        x_next: Float[Array, "state path"],
-        f: Float[Array, "state particle"],
-        log_w: Float[Array, " particle"],
-        uniform: Float[Array, " path"],
+        self, x_next: Float[Array, "state path"], f: Float[Array, "state particle"], log_w, uniform
     ) -> Int[Array, " path"]:
         """Indices with probability proportional to exp(log_w) N(x_next; f, I), by a uniform number for each path."""
         spare = -log_w.shape[0] % self.block

@@ -26,7 +26,6 @@ from ...model.base import Prepared
 from ...numerics.gaussian import Gaussian
 from ...numerics.random import normals
 from .potentials import Potentials, dot, moves
-from .resampling import systematic
 
 
 class ParticleHistory(NamedTuple):
@@ -53,10 +52,7 @@ def _cast(tree, dtype):
 
 
 def _where(condition: Bool[Array, ""], change: Callable, value):
-    """change(value) where the condition holds, or else value.
-
-    Unlike `lax.cond` it costs nothing under `vmap` where no element of the batch needs the change.
-    """
+    """change(value) where the condition holds: under `vmap`, unlike `lax.cond`, only where an element needs it."""
     return jax.lax.while_loop(lambda c: c[0], lambda c: (jnp.zeros_like(c[0]), change(c[1])), (condition, value))[1]
 
 
@@ -74,9 +70,8 @@ def particle_filter(
     arrive = jnp.concatenate([jnp.ones(1, bool), leave[:-1]])
     origin = potentials.origin.astype(dtype)
     scale = jnp.exp(0.5 * model.log_q)
-    start = Gaussian(
-        (model.start.mean - origin[0].astype(exact)) / scale, model.start.cov / (scale[:, None] * scale[None, :])
-    )
+    mean, cov = model.start
+    start = Gaussian((mean - origin[0].astype(exact)) / scale, cov / (scale[:, None] * scale[None, :]))
     steps = _cast(moves(potentials, start), dtype)
     model, scale_, u, y = _cast((model, scale, seq.inputs, seq.y), dtype)
     r = jnp.exp(model.log_r)
@@ -127,8 +122,30 @@ def particle_filter(
     # Drawn time by time: the numbers of a time do not depend on how many follow.
     times = jnp.arange(y.shape[0], dtype=jnp.int32)
     offset = jax.random.uniform(key_offset, y.shape[:1], dtype)
-    _, (x, f, log_w, ancestors, ess, total) = jax.lax.scan(
-        step, (mean, flat, size), (times, offset, arrive, leave, origin, later[0], u, y, seq.observed, steps, later[1])
-    )
+    slices = times, offset, arrive, leave, origin, later[0], u, y, seq.observed, steps, later[1]
+    _, (x, f, log_w, ancestors, ess, total) = jax.lax.scan(step, (mean, flat, size), slices)
     loglik = jnp.sum(total) + log_ahead[0].astype(exact)
     return ParticleHistory(origin.astype(exact), scale, x, f, log_w, ancestors, leave, ess, loglik)
+
+
+def cumsum(x: Float[Array, "*batch n"], block: int = 32) -> Float[Array, "*batch n"]:
+    """`jnp.cumsum` along the last axis as triangular matrix products, within blocks and over them: faster."""
+    n = x.shape[-1]
+    padded = jnp.pad(x, [(0, 0)] * (x.ndim - 1) + [(0, -n % block)])
+    within = upto(padded.reshape(*x.shape[:-1], -1, block), 0)
+    total = within + upto(within[..., -1], 1)[..., None]
+    return total.reshape(padded.shape)[..., :n]
+
+
+def upto(x: Float[Array, "*batch n"], k: int) -> Float[Array, "*batch n"]:
+    """Sums of x over all places up to k before each."""
+    square = jnp.ones((x.shape[-1], x.shape[-1]), x.dtype)
+    return jnp.matmul(x, jnp.triu(square, k), precision=jax.lax.Precision.HIGHEST)
+
+
+def systematic(log_w: Float[Array, " particle"], offset: Float[Array, ""], count: int) -> Int[Array, " {count}"]:
+    """Sorted indices of `count` draws by one uniform `offset` [Kitagawa 1996]."""
+    reach = cumsum(jnp.exp(log_w - jnp.max(log_w)))
+    before = jnp.ceil(reach * (count / reach[-1]) - offset).astype(jnp.int32)  # draws among the particles up to here
+    drops = jnp.zeros(count + 1, reach.dtype).at[jnp.clip(before, 0, count)].add(1, mode="promise_in_bounds")
+    return jnp.minimum(cumsum(drops[:count]).astype(jnp.int32), reach.shape[0] - 1)

@@ -14,14 +14,14 @@ from ..posterior import AbstractSmoother, Posterior
 from ..start import StartBank
 from .backward import ExactBackward, ffbs
 from .filter import ParticleHistory, particle_filter
-from .proposals import AbstractProposal, Lookahead
+from .potentials import Bootstrap, Guided, Lookahead
 
 
 class ParticleSmoother(AbstractSmoother):
     """Draws of p(x_{0:T} | y) through a particle filter guided by a Gaussian smoother."""
 
     guide: GaussianSmoother
-    proposal: AbstractProposal = Lookahead()
+    proposal: Bootstrap | Guided | Lookahead = Lookahead()
     backward: ExactBackward = ExactBackward()
     num_particles: int = eqx.field(static=True, default=300)
     num_paths: int = eqx.field(static=True, default=100)
@@ -39,10 +39,9 @@ class ParticleSmoother(AbstractSmoother):
 
     def history(self, model, seq: Prepared, *, key: PRNGKeyArray) -> ParticleHistory:
         """The filter alone, with its effective sample size."""
-        potentials = self.proposal(model, seq, *self.guide.path(model, seq))
-        return particle_filter(
-            model, potentials, seq, num_particles=self.num_particles, key=key, dtype=jnp.dtype(self.dtype)
-        )
+        potentials = self.proposal(model, seq, *self.guide.tracked(model, seq)[:2])
+        size, dtype = self.num_particles, jnp.dtype(self.dtype)
+        return particle_filter(model, potentials, seq, num_particles=size, key=key, dtype=dtype)
 
     def __call__(self, model, seq: Prepared, *, key: PRNGKeyArray) -> Posterior:
         """Draw paths of one sequence."""

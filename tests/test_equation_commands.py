@@ -69,9 +69,7 @@ def place(tmp_path_factory):
 
 
 REFUSED = {
-    "observer": ("export", "monday", "--observer", "out.c"),
     "mjcf": ("export", "monday", "--mjcf", "out.xml"),
-    "urdf": ("export", "monday", "--urdf", "out.urdf"),
     "design": ("design", "monday", "--out", "out"),
     "diagnose from": ("diagnose", "friday_logs", "--from", "monday", "--out", "out"),
 }
@@ -85,21 +83,6 @@ def test_what_needs_joints_refuses_with_one_sentence_and_writes_nothing(place, c
     lines = [line for line in capsys.readouterr().err.splitlines() if "error" in line]
     assert len(lines) == 1 and "is written as equations" in lines[0] and "joints" in lines[0]
     assert sorted(place.rglob("*")) == before
-
-
-@pytest.mark.slow  # fast: test_a_declared_unknown_term_is_part_of_the_model
-def test_identify_reports_its_unknown_terms(place, monkeypatch):
-    monkeypatch.chdir(place)
-    shutil.copytree(place / "monday_logs", place / "unknown_logs")
-    terms = '[model.unknown]\nf = { signals = ["a"], enters = "a" }\ng = { signals = ["b", "u"], enters = "b" }\n'
-    (place / "unknown_logs" / "rig.toml").write_text(RIG.replace("[sampling]", f"{terms}[sampling]"))
-    assert main(["identify", "unknown_logs", "--out", "unknown", "--epochs", "1"]) == 0
-    report = json.loads((place / "unknown" / "report.json").read_text())
-    assert [(term["name"], term["enters"], term["unit"]) for term in report["unknown"]] == [
-        ("f", "a", "V/s"), ("g", "b", "V/s"),
-    ]  # fmt: skip
-    page = (place / "unknown" / "report.html").read_text()
-    assert "Unknown term f" in page and "Unknown term g" in page
 
 
 def test_two_fits_are_compared_by_their_parameters(place, monkeypatch, capsys):

@@ -131,25 +131,6 @@ def test_mass_and_bias_are_those_of_the_whole_with_joints_held(machine, line, he
         np.testing.assert_allclose(biases[k], (data.qfrc_bias - data.qfrc_spring)[free], atol=1e-10, rtol=1e-10)
 
 
-def test_motors_and_sites_of_a_part_are_those_of_the_file(tmp_path):
-    """A motor of a joint that is held goes; a site of a body that joins another stands where it stood."""
-    (tmp_path / "gripper.xml").write_text(GRIPPER)
-    part = Part(("yaw", "wrist"), {"finger1": 0.02})
-    machine = read_machine(tmp_path / "gripper.xml", part)
-    assert [(motor.name, motor.joint, motor.gear) for motor in machine.motors] == [("t1", 0, 2.0), ("t2", 1, 3.0)]
-    assert [body.name for body in machine.bodies] == ["base", "hand"]
-    assert sum(body.mass for body in machine.bodies) == pytest.approx(3.9, rel=1e-12)
-    (tip,) = machine.sites
-    model = _whole(GRIPPER)
-    data = mujoco.MjData(model)
-    data.qpos[[model.joint("finger1").id, model.joint("finger2").id]] = 0.02, 0.021
-    mujoco.mj_kinematics(model, data)
-    hand = model.body("hand").id
-    way = data.xmat[hand].reshape(3, 3).T @ (data.site_xpos[0] - data.xpos[hand])
-    assert machine.bodies[tip.body].name == "hand"
-    np.testing.assert_allclose(tip.place, way, atol=1e-12)
-
-
 def test_a_loop_that_held_joints_close_is_no_obstacle(tmp_path):
     """A connection of two bodies that hold still against each other."""
     loop = GRIPPER.replace("</equality>", '<connect body1="left" body2="right" anchor="0 0 0"/></equality>')

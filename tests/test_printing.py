@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from nnap_em.data.dataset import Dataset
-from nnap_em.data.logs import Logs
 from nnap_em.data.rig import Declared, Rig
 from nnap_em.effects import catalogue
 from nnap_em.fit.identify import begin
@@ -26,8 +25,6 @@ SAID = {
     "rig": (RIG, "Rig 'bench': pendulum, a row every 0.02 s", "m = 0.5 +- 0.05 kg, lc = 0.2 m", "u on joint 1"),
     "rig noise": (RIG, "theta1 (noise 0.001 rad)", "dtheta1 (noise to be estimated)", "start: theta1 = 0 +- 0.1 rad"),
     "data": (DATA, "Dataset: 3 sequences, 150 rows, the longest 0.98 s; 1 inputs, 2 readings, 5 % missing"),
-    "sequence": (Dataset(*(part[1] for part in DATA)), "1 sequence, 50 rows, the longest 0.98 s", "0 % missing"),
-    "logs": (Logs(("a.csv", "b.csv", "c.csv"), DATA, ("u", "x")), "Logs a.csv to c.csv: u, x; Dataset: 3 sequences"),
 }
 
 

@@ -91,8 +91,7 @@ class Bench(NamedTuple):
 
     rig: Rig
     train: Logs
-    test: Logs | None
-    """Only where there are any; as predictions of the reported error may see them."""
+    test: Logs | None  # Only where there are any; as predictions of the reported error may see them
 
 
 def read_bench(folder: Path, trust: bool, further: Sequence[Path] = ()) -> Bench:
@@ -117,9 +116,7 @@ def read_training(rig: Rig, folders: Sequence[Path], trust: bool) -> Logs:
     names = (folder.resolve().name for folder in folders)
     parts = {name: read_logs(place, rig, trust=trust) for name, place in zip(names, places, strict=True)}
     if len(parts) < len(folders):
-        raise DataError(
-            f"{folders[0]}: two of the folders have one name; rename one: the name of a file begins with it"
-        )
+        raise DataError(f"{folders[0]}: two folders have one name; rename one: names of files begin with it")
     return together(parts)
 
 

@@ -50,7 +50,6 @@ def draft_machine(path: Path, model: Path, home: Path) -> Draft:
 
 
 def _first(fields: Sequence[tuple[Address, str]], names: Sequence[str]) -> Address | None:
-    """Address of the first name that exists."""
     return next((at for name in names for at, word in fields if word == name), None)
 
 
@@ -116,7 +115,6 @@ def _model(machine: Machine, file: str, held: Mapping[str, float]) -> Iterator[s
 
 
 def _driven(machine: Machine, joints: Mapping[str, str]) -> Iterator[str]:
-    """The inputs; no lines where they are the motors of the file."""
     if not machine.motors or len(joints) != len(machine.motors):
         yield from driven(joints, joints=not machine.motors)
         return

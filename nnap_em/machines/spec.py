@@ -143,8 +143,9 @@ def _without_meshes(path: Path, spec: Any) -> None:
 def _refuse(path: Path, error: Exception) -> NoReturn:
     """Raise MachineError with the message of MuJoCo, which has a line where it reads the file."""
     message = re.sub(r", line (-1|0)\b", "", " ".join(str(error).split()))
-    hint = "correct the file: bodies form a tree on a fixed base, each that moves has mass and inertia above 0, "
-    hint += "the largest part of an inertia is at most the sum of the others, and names are different"
+    hint = "correct the file: bodies form a tree on a fixed base, the largest part of an inertia is at most the sum of "
+    hint += "the others, names are different, and each body that moves has an <inertial> above 0 (shapes of URDF weigh "
+    hint += "nothing), or its joint is held: [model] locked = { JOINT = 0.0 }"
     refuse(path, f"MuJoCo's compiler refuses it: {message}", hint)
 
 

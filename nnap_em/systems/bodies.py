@@ -92,14 +92,10 @@ def _together(mass: Scalar, centre: Three, tensor: Turn) -> Numbers:
 class LoadPoint(NamedTuple):
     """Place of a candidate load on the body of a joint, and its typical size."""
 
-    body: int
-    """Place of the body among all."""
-    point: tuple[float, float, float]
-    """Point of a load without a first moment, in the frame of the body [m]."""
-    mass: float
-    """Mean mass of a moving body [kg]."""
-    length: float
-    """Longest distance from a joint to what it carries [m]."""
+    body: int  # Place of the body among all
+    point: tuple[float, float, float]  # Point of a load without a first moment, in the frame of the body [m]
+    mass: float  # Mean mass of a moving body [kg]
+    length: float  # Longest distance from a joint to what it carries [m]
 
 
 def spots(machine: Machine, layout: Layout) -> dict[int, LoadPoint]:

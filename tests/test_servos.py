@@ -235,10 +235,6 @@ def test_what_scales_with_the_gain_and_what_friction_does_is_said(tmp_path):
     rubbed = ("goal.kd", "the learned friction of joint 1")
     assert [set(group) for group in result.together] == [{"m", "I", "goal.kp", *rubbed}]
     assert "goal.kd, the learned friction of joint 1 only in combination" in sentences(result)[0]
-    known = _servo(tmp_path, lines)  # the masses are: then the gain is told, and damping where no friction is learned
-    assert identifiability(known, build_system(known), build_servos(known)) == ((), (rubbed,))
-    bare = dataclasses.replace(known, friction=False)
-    assert identifiability(bare, build_system(bare), build_servos(bare)) == ((), ())
 
 
 # --- numbers that are proportional to columns of the logs

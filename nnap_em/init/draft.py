@@ -74,10 +74,7 @@ class Meaning(NamedTuple):
 
 
 def draft(path: Path, system: str | None, specs: Mapping[str, SystemSpec]) -> Draft:
-    """The rig.toml for a log of a built-in machine; `system` where its names do not show it.
-
-    Raises DataError where the log cannot be read, or nothing in it looks like a machine.
-    """
+    """The rig.toml for a log of a built-in machine; `system` where its names do not show it."""
     topics = reader(path).topics(path)
     states, inputs = found_columns(topics)
     if not states and not inputs:

@@ -55,10 +55,7 @@ class Formula(NamedTuple):
 
 
 def parse(text: str, known: Collection[str]) -> Formula:
-    """The formula of a text in `known` names: + - * / ^, comparisons in `where`, and `FUNCTIONS`.
-
-    Raises FormulaError at the first mistake.
-    """
+    """The formula of a text in `known` names: + - * / ^, comparisons in `where`, and `FUNCTIONS`."""
     try:
         tree = ast.parse(text.replace("^", "**"), mode="eval").body
     except SyntaxError as error:

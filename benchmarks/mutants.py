@@ -653,7 +653,7 @@ an accelerometer without what turning adds
 a sensor in the axes of its joint
 - transposed(product(mount.turn, sensor.turn))
 + transposed(mount.turn)
-# data/rig.py
+# data/table.py
 ## test_rig.py::test_every_mistake_is_named_at_once
 mistakes after the first left unsaid
 - mistakes[str(error)] = error

@@ -105,14 +105,15 @@ def main() -> None:
         index, threads = args.work
         work(args.coordinator, args.processes, index, threads, args.command)
         return
-    if "--out" not in args.command:
-        arguments.error("the command needs --out FOLDER")
-    if args.coordinator and not args.here:
-        arguments.error("--coordinator needs --here N: processes on this machine")
     local = args.here or args.processes
     last = args.first + local - 1
-    if not args.first <= last < args.processes:
-        arguments.error(f"processes {args.first} to {last} of {args.processes}: check --first, --here")
+    for wrong, problem in (
+        ("--out" not in args.command, "the command needs --out FOLDER"),
+        (args.coordinator and not args.here, "--coordinator needs --here N: processes on this machine"),
+        (not args.first <= last < args.processes, f"no processes {args.first} to {last} of {args.processes}"),
+    ):
+        if wrong:
+            arguments.error(problem)
     threads = max(1, cores() // local)
     address = args.coordinator or free_address()
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")

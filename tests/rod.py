@@ -18,10 +18,6 @@ NOISE = (1e-3, 1e-2)
 FILE = f"""<mujoco><compiler angle="radian"/><worldbody><body name="rod"><joint name="hinge" axis="0 -1 0"/>
 <inertial pos="0 0 -{LENGTH}" mass="{MASS}" diaginertia="{INERTIA} {INERTIA} {INERTIA}"/>
 <site name="tip" pos="0 0 -0.4"/></body></worldbody><actuator><motor name="tau" joint="hinge"/></actuator></mujoco>"""
-URDF = f"""<robot name="rod"><link name="base"/><link name="rod"><inertial><origin xyz="0 0 -{LENGTH}"/>
-<mass value="{MASS}"/><inertia ixx="{INERTIA}" iyy="{INERTIA}" izz="{INERTIA}" ixy="0" ixz="0" iyz="0"/></inertial>
-</link>
-<joint name="hinge" type="continuous"><parent link="base"/><child link="rod"/><axis xyz="0 -1 0"/></joint></robot>"""
 Level = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 """Size of a friction [N m] by torque of the motor, torque of the weight, and rate."""
 

@@ -3,7 +3,6 @@
 import argparse
 import json
 import re
-import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -17,12 +16,9 @@ from shell import ROOT
 from nnap_em.commands import cli
 from nnap_em.commands import identify as identify_command
 from nnap_em.commands import smooth as smooth_command
-from nnap_em.data.logs import read_logs
 from nnap_em.data.rig import read_rig
-from nnap_em.diagnosis.findings import Estimate
 from nnap_em.fit.store import load, read
 from nnap_em.model.simulate import examples
-from nnap_em.report import tables
 from nnap_em.smoother import AbstractSmoother
 from nnap_em.smoother.start import StartBank
 from nnap_em.storage.journal import Journal
@@ -125,23 +121,6 @@ def test_simulated_logs_are_the_truth_with_the_declared_noise(tmp_path):
     assert (tmp_path / "b/train/000.csv").read_bytes() != (tmp_path / "a/train/000.csv").read_bytes()
 
 
-@pytest.mark.parametrize("system", ["acrobot", "pendubot", "pendulum"])
-def test_every_system_is_simulated(tmp_path, system):
-    assert nnap("simulate", tmp_path / "a", "--system", system, "--sequences", 1, "--test", 0, "--steps", 30) == 0
-    declared = read_rig(tmp_path / "a/rig.toml", specs)
-    table = read_logs(tmp_path / "a/train", declared).data
-    assert table.y.shape == (1, 31, len(declared.measured))
-    assert np.isfinite(table.y).all()
-    assert not (tmp_path / "a/test").exists()
-
-
-def test_a_folder_with_something_in_it_is_left_alone(bench, capsys):
-    before = _files(bench)
-    assert nnap("simulate", bench, *SIMULATE) == 2
-    assert "is there already; give a new folder" in capsys.readouterr().err
-    assert _files(bench) == before
-
-
 def test_identify_writes_whole_results(bench, fit):
     assert _files(fit) == ["friction.csv", "friction.png", "model.npz", "report.html", "report.json"]
     assert (fit / "friction.png").read_bytes().startswith(b"\x89PNG")
@@ -162,21 +141,6 @@ def test_identify_writes_whole_results(bench, fit):
     assert stored.notes["settings"] == {"smoother": "cubature", "particles": None, "seed": 0}
     assert [epoch["epoch"] for epoch in stored.notes["epochs"]] == list(range(1, EPOCHS + 1))
     assert stored.fitted.rig == read_rig(bench / "rig.toml", specs)
-
-
-@pytest.mark.slow  # fast: test_particle.py
-def test_particles_identify_as_well(bench, fit, tmp_path):
-    """Two epochs with few particles, against the same epochs of the cubature smoother: the slide is almost linear."""
-    argv = ("--smoother", "particle", "--particles", 50, "--epochs", 2, "--quiet")
-    assert nnap("identify", bench, "--out", tmp_path, *argv) == 0
-    assert _files(tmp_path) == _files(fit)
-    particles, other = (json.loads((folder / "report.json").read_text()) for folder in (tmp_path, fit))
-    assert read(tmp_path / "model.npz").notes["settings"] == {"smoother": "particle", "particles": 50, "seed": 0}
-    assert particles["left_out"] == []
-    # the same first model: within what `fit` allows for the noise of a stochastic smoother
-    assert particles["log_likelihood"][0] == pytest.approx(other["log_likelihood"][0], abs=0.5)
-    assert particles["log_likelihood"][1] > particles["log_likelihood"][0] + 10
-    assert all(np.isfinite(values).all() for values in _read(tmp_path / "friction.csv").values())
 
 
 def test_the_learned_friction_is_the_true_one(bench, fit):
@@ -215,18 +179,6 @@ def test_reported_errors_are_those_of_the_predictions_which_contain_the_truth(be
     for horizon, reported in zip(report["horizons_s"], report["x"], strict=True):
         inside = (since > 1e-6) & (since < horizon + 1e-6) & np.isfinite(miss)
         np.testing.assert_allclose(reported, np.sqrt(np.mean(miss[inside] ** 2)), rtol=1e-6)
-
-
-def test_readings_after_the_given_time_change_nothing(bench, fit, tmp_path):
-    shutil.copytree(bench / "test", tmp_path / "test")
-    for path in (tmp_path / "test").iterdir():
-        lines = path.read_text().splitlines()
-        lines[42:] = [line.rpartition(",")[0] + "," for line in lines[42:]]
-        path.write_text("\n".join(lines) + "\n")
-    for folder, out in ((bench / "test", "a"), (tmp_path / "test", "b")):
-        assert nnap("predict", fit, folder, "--given", "0.4", "--out", tmp_path / out) == 0
-    for name in _files(tmp_path / "a"):
-        assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
 
 
 def test_smoothed_states_are_nearer_the_truth_than_the_readings(bench, fit, tmp_path):
@@ -280,43 +232,13 @@ def test_a_run_that_was_stopped_goes_on_to_the_same_numbers(bench, fit, tmp_path
     assert all(np.array_equal(a, b) for a, b in leaves if isinstance(a, jax.Array))
 
 
-def test_without_test_sequences_there_is_no_error_to_report(bench, fit, tmp_path, monkeypatch, capsys):
-    """A fit is given the training sequences alone, where there are others and where there are none."""
-    shutil.copytree(bench, tmp_path / "bench")
-    shutil.rmtree(tmp_path / "bench/test")
-    fitted = load(fit / "model.npz")
-    train = read_logs(bench / "train", fitted.rig).data
-
-    def identify(rig, data, *, watch, **_):
-        assert all(map(np.array_equal, data, train))
-        watch(fitted.state, data.t.shape[1], np.ones(len(data.t), bool))
-        return fitted
-
-    monkeypatch.setattr(identify_command, "identify", identify)
-    for folder in (bench, tmp_path / "bench"):
-        assert nnap("identify", folder, "--out", tmp_path / "out", "--epochs", 1) == 0
-    report = json.loads((tmp_path / "out/report.json").read_text())
-    assert report["fit"] is report["error"] is None
-    assert "no test sequences" in report["error_note"] and "no test sequences" in capsys.readouterr().err
-
-
-def test_json_has_null_for_what_is_no_number():
-    """Named tuples are written by their fields, arrays as lists."""
-    found = {"a": (1.0, np.asarray([2.0, np.nan])), "b": {"c": float("inf"), "d": "é"}, "e": Estimate(3.0, 0.1, "kg")}
-    content = json.loads(tables.json_text(found), parse_constant=pytest.fail)
-    assert content == {
-        "a": [1.0, [2.0, None]], "b": {"c": None, "d": "é"}, "e": {"value": 3.0, "std": 0.1, "unit": "kg"}
-    }  # fmt: skip
-
-
 BAD = {
     "identify bench --out bench/rig.toml": r"rig\.toml: File exists",
+    "simulate bench --system slide": "is there already; give a new folder",
     "smooth bench bench/test --out out": "model.npz: cannot be read",
-    "smooth bench/test/000.csv bench/test --out out": r"000\.csv: no model",
     "predict fit nothing --given 1 --out out": "nothing: is no folder",
     "design fit --out out --for speed": "--for speed: not a question of this fit; possible here: friction, .*all",
     "simulate out --system slide --measured y": "--measured y: no state of this system; possible here: x, dx",
-    "simulate out --system slide --measured x x": "--measured x x: a state stands there twice",
 }
 
 
@@ -337,10 +259,7 @@ USAGE = {
     "identify bench --out x --epochs 0": "found '0'; give a whole number of 1 or more",
     "identify bench --out x --particles 9": "--particles goes with --smoother particle",
     "identify bench --out x --smoother ukf": "invalid choice: 'ukf'",
-    "diagnose bench --out x --logs bench": "--logs goes with --from FIT",
-    "export fit --out x --float": "--float goes with --observer FILE",
     "predict m t --out x --given -1": "found '-1'; give seconds, 0 or more",
-    "predict m t --out x --given nan": "found 'nan'; give seconds",
     "simulate x --process-noise 0 1": "found '0'; give a number above 0",
 }
 
@@ -359,16 +278,3 @@ def test_a_mistake_of_ours_is_not_hidden(bench, fit, tmp_path, monkeypatch):
     monkeypatch.setattr(smooth_command, "smooth", bug)
     with pytest.raises(ZeroDivisionError):
         nnap("smooth", fit, bench / "test", "--out", tmp_path / "out")
-
-
-def test_values_that_run_away_become_empty_fields(bench, fit, tmp_path, monkeypatch, capsys):
-    whole = smooth_command.smooth
-
-    def lost(fitted, data):
-        state = whole(fitted, data)
-        return state._replace(mean=state.mean.at[2, 10:, 1].set(np.inf))
-
-    monkeypatch.setattr(smooth_command, "smooth", lost)
-    assert nnap("smooth", fit, bench / "test", "--out", tmp_path) == 0
-    assert f"nnap-em: warning: 002.csv: {STEPS + 1 - 10} values run away" in capsys.readouterr().err
-    assert np.isnan(_read(tmp_path / "002.csv")["dx"]).sum() == STEPS + 1 - 10

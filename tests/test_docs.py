@@ -24,14 +24,12 @@ _BLOCK = re.compile(r"(?:^<!-- not run:(?P<reason>.*?)-->\n)?^```(?P<kind>.*)\n(
 
 
 class Block(NamedTuple):
-    """A fenced block."""
+    """A fenced block, the line where its text begins, and the reason why it is not run."""
 
     kind: str
     text: str
     line: int
-    """Where its text begins."""
     reason: str | None
-    """Why it is not run."""
 
 
 def _blocks(page: Path) -> list[Block]:
@@ -84,11 +82,8 @@ def test_every_block_is_run_or_says_why_not():
 RUNNING = [p for p in PAGES if any(b.kind in RUN for b in _blocks(p))]
 
 
-@pytest.mark.parametrize(
-    "page",
-    [pytest.param(p, marks=() if p.name == "README.md" else pytest.mark.slow) for p in RUNNING],
-    ids=[str(p.relative_to(ROOT)) for p in RUNNING],
-)
+@pytest.mark.slow  # fast: test_cli.py has the commands of README.md, test_public.py the functions
+@pytest.mark.parametrize("page", RUNNING, ids=lambda page: str(page.relative_to(ROOT)))
 def test_page_runs(page, tmp_path, monkeypatch, registries):
     monkeypatch.chdir(tmp_path)
     module = ModuleType("page")

@@ -6,8 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import data_sets
-from recorders import Q, T, robot_log
+from recorders import Q, robot_log
 
 from nnap_em.commands import cli
 from nnap_em.data.dataset import DataError
@@ -41,10 +40,8 @@ def _filled(text: str) -> str:
 
 
 SYSTEMS = {  # columns, system given, the system, inputs and joints that must be told
-    "slide": (("f", "x", "dx"), None, "slide", {"f": 1}),
     "acrobot": (("tau2", "theta1", "theta2"), None, "acrobot", {"tau2": 2}),
     "pendubot": (("tau1", "theta1", "theta2", "dtheta2"), None, "pendubot", {"tau1": 1}),
-    "both driven": (("u1", "u2", "theta2", "dtheta2", "note"), None, "acrobot", {"u1": 1, "u2": 2}),
     "hidden joint": (("u", "theta1", "dtheta1"), "acrobot", "acrobot", {"u": 2}),
 }
 
@@ -71,7 +68,6 @@ MAPPED = {  # columns, then inputs with their joints, and lines of [import.colum
     "from 0": (("u0", "u1", "q0", "q1"), {"u0": 1, "u1": 2}, ['"theta1" = "q0"', '"theta2" = "q1"']),
     "other names": (("u", "q1", "qdot1"), {"u": 2}, ['"theta1" = "q1"', '"dtheta1" = "qdot1"']),
     "degrees": (("u", "theta1 [deg]"), {"u": 2}, ['"theta1" = { from = "theta1 [deg]", scale = 0.0174532925 }']),
-    "twice": (("u", "angle1", "theta1"), {"u": 2}, []),
 }
 
 
@@ -129,55 +125,6 @@ def test_the_command_writes_once_and_never_over(tmp_path, capsys):
     assert not (tmp_path / "other").exists()
 
 
-def test_the_shared_rigs_are_drafted_as_their_owners_declared_them(shared, tmp_path):
-    paths = [path for path in data_sets(shared) if not specs[read_rig(path, specs).system].declare]
-    assert paths
-    for path in paths:
-        owner = read_rig(path, specs)
-        drafted = draft(sorted((path.parent / "train").glob("*.csv"))[0], owner.system, specs)
-        assert not drafted.mapped
-        (tmp_path / "rig.toml").write_text(_filled(drafted.text))
-        rig = read_rig(tmp_path / "rig.toml", specs)
-        assert (rig.dt, rig.clock) == (owner.dt, owner.clock)
-        assert set(owner.measured) <= set(rig.measured)  # an owner may leave out the rates of a file
-        assert dict(zip(rig.input_columns, rig.input_joints, strict=True)) == dict(
-            zip(owner.input_columns, owner.input_joints, strict=True)
-        )
-
-
-# --- topics
-
-
-@pytest.mark.parametrize("command, inputs", [("/effort_controller/commands", "data[0]"), (None, "effort[hip]")])
-def test_a_robot_is_drafted_and_imported(tmp_path, command, inputs):
-    log = robot_log(tmp_path / "a.mcap", command)
-    assert cli.main(["init", str(log), "--system", "acrobot"]) == 0
-    path = tmp_path / "rig.toml"
-    path.write_text(_filled(path.read_text()))
-    rig = read_rig(path, specs)
-    assert (rig.dt, rig.measured) == (0.004, ("theta1", "theta2", "dtheta1", "dtheta2"))
-    assert dict(zip(rig.input_columns, rig.input_joints, strict=True)) == {"tau1": 1, "tau2": 2}
-    assert rig.noise_std["theta1"] == pytest.approx(1e-3, rel=0.1)  # the median of 2000 third differences
-    assert f'"tau1" = "{command or "/joint_states"}:{inputs}"' in path.read_text()
-    argv = ["import", str(log), "--rig", str(path), "--out", str(tmp_path / "out"), "--test", "0"]
-    assert cli.main(argv) == 0
-    assert (tmp_path / "out/train/000.csv").read_text().startswith("time,tau1,tau2,theta1,theta2,dtheta1,dtheta2\n")
-
-
-def test_runs_with_times_of_day_are_drafted(tmp_path):
-    """Silences between runs are no readings without noise."""
-    rows, rng = ["Date,Time,Torque [Nm],Angle [deg]"], np.random.default_rng(0)
-    for run in range(4):
-        for k in range(300):
-            angle = 20 * np.sin(0.05 * k) + 0.1 * rng.normal()
-            rows.append(f"03.11.2026,12:{10 * run:02}:{k / 100:06.3f},{np.cos(0.1 * k):.6f},{angle:.6f}")
-    (tmp_path / "a.csv").write_text("\n".join(rows) + "\n")
-    text = draft(tmp_path / "a.csv", "pendulum", specs).text
-    assert "dt = 0.01 " in text and '"Torque" = "Torque [Nm]"' in text and '"theta1" = { from = "Angle [deg]"' in text
-    noise = float(re.search(r"(?m)^theta1 = ([\d.e-]+) ", text)[1])
-    assert noise == pytest.approx(np.radians(0.1), rel=0.2)  # a median of 1,200
-
-
 # --- a machine in a file
 
 LEG = functools.partial(robot_log, command="/torques/commands", joints=("knee", "hip"))
@@ -233,22 +180,3 @@ def test_servos_and_uncertain_numbers_of_a_file_are_drafted_by_taking_marks_away
     assert {name: (p.mean, p.std) for name, p in rig.parameters.items()} == {
         "thigh.mass": (1.5, 0.15), "shank.mass": (1.0, 0.1), "hip.armature": (0.02, 0.02), "knee.armature": (0.0, 0.01),
     }  # fmt: skip
-
-
-HEADERS = {  # header of a log, its readings, and lines of [import.columns]
-    "time,hip,knee,m_hip": (("hip", "knee"), []),
-    "t,hip_encoder,knee,tau_hip": (("hip_encoder", "knee"), ['"m_hip" = "tau_hip"']),
-    "t,q0,q1,u": (("hip", "knee"), ['"hip" = "q0"', '"knee" = "q1"', '"m_hip" = "u"']),
-}
-
-
-@pytest.mark.parametrize("header, measured, lines", [(h, *rest) for h, rest in HEADERS.items()], ids=HEADERS)
-def test_plain_columns_by_names_of_joints_sensors_and_by_number(tmp_path, header, measured, lines):
-    sensors = '<jointpos name="hip_encoder" joint="hip"/>'
-    model, path = _leg(tmp_path / "leg.xml", '<motor name="m_hip" joint="hip"/>', sensors), tmp_path / "log.csv"
-    np.savetxt(path, np.column_stack([T, Q, T**2]), delimiter=",", header=header, comments="", fmt="%.9g")
-    text = draft_machine(path, model, tmp_path).text
-    (tmp_path / "rig.toml").write_text(text)
-    rig = read_rig(tmp_path / "rig.toml", specs)
-    assert (rig.measured, rig.input_columns, rig.dt) == (measured, ("m_hip",), 0.004)
-    assert re.findall(r'(?m)^".*', text.partition("[import.columns]")[2]) == lines

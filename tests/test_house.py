@@ -1,4 +1,4 @@
-"""Imports point one way: a folder knows only the folders above it; random numbers hang on a key that is passed."""
+"""Imports point one way: a folder knows only the folders above it."""
 
 import ast
 import re
@@ -6,8 +6,6 @@ from pathlib import Path
 
 import pytest
 from shell import ROOT
-
-import nnap_em
 
 FOLDERS = ("numerics", "storage", "data", "machines", "import_", "systems", "effects", "model", "smoother", "em",
            "fit", "diagnosis", "comparison", "experiment", "report",
@@ -37,15 +35,3 @@ def test_every_folder_is_in_the_order():
     folders = {p.name for p in PACKAGE.iterdir() if p.is_dir() and p.name != "__pycache__"}
     assert folders == set(FOLDERS)
     assert tuple(re.findall(r"\]\(nnap_em/(\w+)/\)", (ROOT / "CONTRIBUTING.md").read_text())) == FOLDERS
-
-
-def test_no_folder_has_the_name_of_a_public_function():
-    """Its import would replace the function as an attribute of the package."""
-    assert not set(FOLDERS) & set(nnap_em._home)
-
-
-def test_random_numbers_hang_on_a_key_that_is_passed():
-    """None is made of a constant, but where nothing is drawn: a check, and the blank fit that a file fills."""
-    constant = re.compile(r"random\.(?:key|PRNGKey)\(\d")
-    found = {str(p.relative_to(PACKAGE)) for p in PACKAGE.rglob("*.py") if constant.search(p.read_text())}
-    assert found == {"commands/check.py", "fit/store.py"}

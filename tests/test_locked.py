@@ -1,7 +1,6 @@
 """A part of a machine file: joints that are held, against MuJoCo's own model of the whole with those joints held."""
 
 import dataclasses
-import re
 import tomllib
 from pathlib import Path
 
@@ -52,44 +51,11 @@ GRIPPER = """
 """
 """Fingers that follow each other, driven by a servo over a tendon; a hand with three joints."""
 
-URDF = """
-<robot name="gripper">
-  <link name="base"/>
-  <link name="arm"><inertial><origin xyz=".1 0 .02" rpy=".1 .2 .3"/><mass value="1.5"/>
-    <inertia ixx=".01" iyy=".02" izz=".015" ixy=".001" ixz="0" iyz=".002"/></inertial></link>
-  <link name="hand"><inertial><origin xyz=".02 0 0"/><mass value=".4"/>
-    <inertia ixx=".001" iyy=".001" izz=".002" ixy="0" ixz="0" iyz="0"/></inertial></link>
-  <link name="flange"/>
-  <link name="left"><inertial><origin xyz="0 .01 0"/><mass value=".1"/>
-    <inertia ixx="1e-4" iyy="1e-4" izz="1e-4" ixy="0" ixz="0" iyz="0"/></inertial></link>
-  <link name="right"/>
-  <joint name="shoulder" type="revolute"><parent link="base"/><child link="arm"/><axis xyz="0 1 0"/>
-    <origin xyz="0 0 .3" rpy=".2 0 0"/><limit lower="-2" upper="2" effort="1" velocity="1"/></joint>
-  <joint name="wrist" type="continuous"><parent link="arm"/><child link="flange"/><axis xyz="1 0 0"/>
-    <origin xyz=".3 0 0" rpy="0 .4 0"/></joint>
-  <joint name="mount" type="fixed"><parent link="flange"/><child link="hand"/><origin xyz=".05 0 0"/></joint>
-  <joint name="finger1" type="prismatic"><parent link="hand"/><child link="left"/><axis xyz="0 1 0"/>
-    <origin xyz=".05 .01 0" rpy="0 0 .3"/><limit lower="0" upper=".04" effort="1" velocity="1"/></joint>
-  <joint name="finger2" type="prismatic"><parent link="hand"/><child link="right"/><axis xyz="0 -1 0"/>
-    <origin xyz=".05 -.01 0"/><limit lower="0" upper=".04" effort="1" velocity="1"/>
-    <mimic joint="finger1" multiplier="1.5" offset=".002"/></joint>
-</robot>
-"""
-"""A finger of no weight that mimics the other."""
-
 
 def _rig(folder: Path, machine: str, model: str, name: str = "machine.xml", measured: str = "") -> Path:
     (folder / name).write_text(machine)
     (folder / "rig.toml").write_text(file_rig(name, (measured,), f"{model}\n[input]\ncolumns = []\njoints = []\n"))
     return folder / "rig.toml"
-
-
-def _whole(machine: str) -> mujoco.MjModel:
-    """MuJoCo's model with every joint; what mimics is free, and a finger without weight weighs 1e-14 kg."""
-    bound = '<compiler boundmass="1e-14" boundinertia="1e-14" fusestatic="false"'
-    text = re.sub(r"<mimic[^>]*/>", "", machine)
-    text = text.replace('<robot name="gripper">', f'<robot name="gripper"><mujoco>{bound}/></mujoco>')
-    return mujoco.MjModel.from_xml_string(text)
 
 
 CASES = {  # name: (machine, what is held, joints that are held besides)
@@ -101,16 +67,13 @@ CASES = {  # name: (machine, what is held, joints that are held besides)
         GRIPPER, 'joints = ["yaw", "wrist"]\nlocked = { finger1 = 0.02 }',
         {"finger2": 0.021, "elbow": 0.1, "slide": 0.0, "tool": 0.0},
     ),
-    "a URDF gripper that mimics": (
-        URDF, 'joints = ["shoulder", "wrist"]\nlocked = { finger1 = 0.02 }', {"finger2": 0.032},
-    ),
 }  # fmt: skip
 
 
 @pytest.mark.filterwarnings("ignore:.*are left out, as friction is learned:nnap_em.data.rig.RigWarning")
 @pytest.mark.parametrize(("machine", "line", "held"), CASES.values(), ids=CASES)
 def test_mass_and_bias_are_those_of_the_whole_with_joints_held(machine, line, held, tmp_path):
-    model, held = _whole(machine), tomllib.loads(line)["locked"] | held
+    model, held = mujoco.MjModel.from_xml_string(machine), tomllib.loads(line)["locked"] | held
     names = [model.joint(j).name for j in range(model.njnt)]
     free = [j for j, name in enumerate(names) if name not in held]
     system = build_system(read_rig(_rig(tmp_path, machine, line, measured=names[free[0]]), specs))
@@ -129,25 +92,6 @@ def test_mass_and_bias_are_those_of_the_whole_with_joints_held(machine, line, he
         mujoco.mj_fullM(model, data, mass)
         np.testing.assert_allclose(masses[k], mass[np.ix_(free, free)], atol=1e-10, rtol=1e-10)
         np.testing.assert_allclose(biases[k], (data.qfrc_bias - data.qfrc_spring)[free], atol=1e-10, rtol=1e-10)
-
-
-def test_motors_and_sites_of_a_part_are_those_of_the_file(tmp_path):
-    """A motor of a joint that is held goes; a site of a body that joins another stands where it stood."""
-    (tmp_path / "gripper.xml").write_text(GRIPPER)
-    part = Part(("yaw", "wrist"), {"finger1": 0.02})
-    machine = read_machine(tmp_path / "gripper.xml", part)
-    assert [(motor.name, motor.joint, motor.gear) for motor in machine.motors] == [("t1", 0, 2.0), ("t2", 1, 3.0)]
-    assert [body.name for body in machine.bodies] == ["base", "hand"]
-    assert sum(body.mass for body in machine.bodies) == pytest.approx(3.9, rel=1e-12)
-    (tip,) = machine.sites
-    model = _whole(GRIPPER)
-    data = mujoco.MjData(model)
-    data.qpos[[model.joint("finger1").id, model.joint("finger2").id]] = 0.02, 0.021
-    mujoco.mj_kinematics(model, data)
-    hand = model.body("hand").id
-    way = data.xmat[hand].reshape(3, 3).T @ (data.site_xpos[0] - data.xpos[hand])
-    assert machine.bodies[tip.body].name == "hand"
-    np.testing.assert_allclose(tip.place, way, atol=1e-12)
 
 
 def test_a_loop_that_held_joints_close_is_no_obstacle(tmp_path):
@@ -197,7 +141,7 @@ def test_a_part_is_written_back_as_the_part(tmp_path):
     model = mujoco.MjModel.from_xml_path(str(tmp_path / "out.xml"))
     assert [model.joint(j).name for j in range(model.njnt)] == ["yaw", "slide", "tool"]
     assert (model.nbody, model.neq, model.ntendon, model.site("tip").id) == (3, 0, 0, 0)
-    data, whole = mujoco.MjData(model), _whole(GRIPPER)
+    data, whole = mujoco.MjData(model), mujoco.MjModel.from_xml_string(GRIPPER)
     mass, other = np.zeros((3, 3)), mujoco.MjData(whole)
     data.qpos[:] = other.qpos[[0, 2, 4]] = 0.3, -0.05, 0.7
     other.qpos[[1, 3, 5, 6]] = 0.0, 0.9, 0.0, 0.0

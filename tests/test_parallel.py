@@ -17,7 +17,6 @@ import pytest
 from helpers import nnap
 from shell import ENVIRONMENT
 
-from nnap_em import launch
 from nnap_em.launch import free_address
 from nnap_em.numerics.parallel import all_devices, each, over
 
@@ -40,31 +39,6 @@ def test_groups_and_a_mesh_change_nothing():
     mesh = jax.make_mesh((1,), ("data",), axis_types=(jax.sharding.AxisType.Auto,))
     with pytest.raises(ValueError, match="seq"), over(mesh):
         pass
-
-
-OWN_DEVICES = """
-import jax, jax.numpy as jnp
-from nnap_em.commands import common
-from nnap_em.numerics import parallel
-common.set_up()
-seen = []
-program = parallel._program
-parallel._program = lambda function: lambda mesh, *rest: seen.append(mesh.size) or program(function)(mesh, *rest)
-draw = lambda common, one: (common * one[0], jax.random.normal(one[1]))
-for count in (1, 3, 5, 8):
-    batch = jnp.arange(float(count)), jax.random.split(jax.random.key(0), count)
-    out = parallel.each(draw, jnp.asarray(2.0), batch)
-    assert jnp.array_equal(out[0], 2.0 * batch[0])
-    assert jnp.array_equal(out[1], jax.vmap(jax.random.normal)(batch[1]))
-print(seen)
-"""
-
-
-def test_devices_of_ones_own_number_are_used_where_they_have_work():
-    """Five sequences on four devices are two for each of three; numbers are those of one device."""
-    environment = {**ENVIRONMENT, "JAX_NUM_CPU_DEVICES": "4"}
-    done = subprocess.run([sys.executable, "-c", OWN_DEVICES], env=environment, capture_output=True, text=True)
-    assert done.stdout == "[1, 3, 3, 4]\n", done.stderr
 
 
 @pytest.fixture(scope="module")
@@ -108,21 +82,6 @@ def test_two_launchers_are_two_machines_whose_processes_agree_with_one(rig, tmp_
     assert not (tmp_path / "1").exists()
 
 
-WRONG = {
-    "--coordinator localhost:1 2 identify . --out x": "--coordinator needs --here N: processes on this machine",
-    "--coordinator localhost:1 --here 2 --first 1 2 identify . --out x": "processes 1 to 2 of 2: check --first, --here",
-    "2 identify .": "the command needs --out FOLDER",
-}
-
-
-@pytest.mark.parametrize("line", WRONG)
-def test_several_machines_need_to_know_their_share(line, monkeypatch, capsys):
-    monkeypatch.setattr(sys, "argv", ["launch", *line.split()])
-    with pytest.raises(SystemExit, match="2"):
-        launch.main()
-    assert WRONG[line] in capsys.readouterr().err
-
-
 TOY = """
 import sys, time
 if "--work" in sys.argv:  # not in the process that starts the others
@@ -149,14 +108,6 @@ def toy(rig, tmp_path) -> Iterator[subprocess.Popen]:
             assert run.poll() is None and time.monotonic() < deadline
             time.sleep(0.1)
         yield run
-
-
-@pytest.mark.slow  # fast: test_a_chain_of_all_faults_is_survived
-def test_ctrl_c_says_how_to_go_on(toy):
-    os.killpg(toy.pid, signal.SIGINT)  # as a terminal does
-    _, said = toy.communicate(timeout=60)
-    assert toy.returncode == 130
-    assert "the same command goes on" in said
 
 
 @pytest.mark.slow  # fast: test_a_chain_of_all_faults_is_survived

@@ -1,14 +1,11 @@
 """Compiled programs: their table, the flags of the compiler, and their release where they hold too many memory maps."""
 
-import os
-import time
-
 import jax
 import jax.numpy as jnp
 
 from nnap_em.numerics import programs
 from nnap_em.numerics.parallel import each
-from nnap_em.numerics.profile import profiling, stage
+from nnap_em.numerics.profile import profiling
 
 
 def test_programs_are_counted_once_for_every_shape_and_by_name(capsys):
@@ -42,40 +39,9 @@ def test_a_program_for_every_sequence_is_compiled_once_whether_or_not_its_arrays
     assert jnp.array_equal(first, again)
 
 
-def test_time_counts_for_the_outermost_stage_alone():
-    @stage("refit")
-    def inner():
-        time.sleep(0.02)
-
-    with profiling() as profile:
-        with stage("fit"):
-            inner()
-        inner()
-    (fit,), (refit,) = profile.spent["fit"]["run"], profile.spent["refit"]["run"]
-    assert fit >= 0.02 <= refit
-    rows = {line.split()[0]: line.split() for line in str(profile).splitlines()}
-    assert [rows[name][-1] for name in ("fit", "refit")] == [f"{fit:.2f}", f"{refit:.2f}"]
-
-
 def test_programs_are_released_beyond_the_bound(monkeypatch):
     cleared = []
     monkeypatch.setattr(jax, "clear_caches", lambda: cleared.append(True))
     monkeypatch.setattr(programs, "maps", lambda: 50)
     assert not programs.release_programs(50) and not cleared
     assert programs.release_programs(49) and cleared == [True]
-
-
-FLAGS = [
-    ("0.10.2", "", "--xla_cpu_use_fusion_emitters=false"),
-    ("0.10.2", "--xla_a=1", "--xla_a=1 --xla_cpu_use_fusion_emitters=false"),
-    ("0.10.2", "--xla_cpu_use_fusion_emitters=true", "--xla_cpu_use_fusion_emitters=true"),
-    ("0.11.0", "--xla_a=1", "--xla_a=1"),
-]
-
-
-def test_the_older_emitters_are_asked_for_where_they_are_known(monkeypatch):
-    for version, before, after in FLAGS:
-        monkeypatch.setenv("XLA_FLAGS", before)
-        monkeypatch.setattr(programs.version, "__version__", version)
-        programs.use_older_emitters()
-        assert os.environ["XLA_FLAGS"] == after

@@ -31,16 +31,10 @@ FUNCTIONS = {
 def test_names_are_loaded_from_their_homes_and_listed():
     assert nnap_em.identify is importlib.import_module("nnap_em.fit.identify").identify
     assert set(TOP) <= set(dir(nnap_em))
+    version = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
+    assert version == nnap_em.__version__
     with pytest.raises(AttributeError, match="no attribute 'identity'"):
         _ = nnap_em.identity  # type: ignore[attr-defined]
-
-
-def test_version_is_that_of_the_package(capsys):
-    with pytest.raises(SystemExit, match="0"):
-        nnap("--version")
-    version = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
-    assert capsys.readouterr().out == f"nnap-em {version}\n"
-    assert version == nnap_em.__version__
 
 
 def test_reference_has_every_public_name():
@@ -75,7 +69,10 @@ EXAMPLES = {
 }
 
 
-@pytest.mark.parametrize("name", sorted(EXAMPLES))
+DEAR = ("check", "identify_from", "smoothers.ExtendedKalmanSmoother")  # fast: test_check.py, test_changed.py
+
+
+@pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] * (n in DEAR)) for n in sorted(EXAMPLES)])
 def test_an_example_runs(name, names):
     example = EXAMPLES[name]
     example.globs = dict(names)

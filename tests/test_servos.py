@@ -14,18 +14,14 @@ from nnap_em.data.dataset import Dataset
 from nnap_em.data.logs import DataError, read_logs
 from nnap_em.data.rig import Declared, Rig, RigError, read_rig
 from nnap_em.data.servo import KINDS
-from nnap_em.diagnosis.columns import candidate_columns, tracks
-from nnap_em.effects import Candidate
-from nnap_em.effects.actuator import InputDelay, MotorGain, Saturation
-from nnap_em.em.build import build, build_system, measure_scales
+from nnap_em.effects.actuator import InputDelay
+from nnap_em.em.build import build, build_system
 from nnap_em.em.servos import build_servos
 from nnap_em.export.model import ExportError, write_model
 from nnap_em.fit.identifiability import identifiability, sentences
 from nnap_em.fit.identify import begin
 from nnap_em.fit.store import load, save
 from nnap_em.model.servo import LAWS
-from nnap_em.model.state_space import with_effects
-from nnap_em.numerics.gaussian import Gaussian
 from nnap_em.systems import specs
 
 BODY = '<inertial pos="0 0 -.2" mass=".5" diaginertia=".002 .002 .002"/>'
@@ -143,37 +139,6 @@ def test_a_voltage_is_a_velocity_servo_of_its_own_gain(tmp_path):
     np.testing.assert_allclose(_drives([driven], x, u)[0], _drives([servo], x, u / k)[0], rtol=1e-12)
 
 
-def test_the_drive_along_states_is_that_of_the_model_with_the_laws(tmp_path):
-    """Columns of candidates are its changes by each law, of a torque and of a servo beside it; the torque with its
-    laws is what it is without the servo.
-    """
-    text = '[input]\ncolumns = ["goal", "tau"]\njoints = [2, 1]\n'
-    both = servo_model(_rig(tmp_path, f"{text}[input.goal]\n{SERVO}kp = 3.0\nkd = 0.5", model=ACROBOT))
-    torques, rng = servo_model(_rig(tmp_path, text, model=ACROBOT)), np.random.default_rng(4)
-    kinds = InputDelay.of(0.013, joint=1), Saturation.of(0.5, joint=2), MotorGain.of(-0.2, joint=1)
-    laws = *kinds, *(dataclasses.replace(law, joint=3 - law.joint) for law in kinds)
-    data = jax.tree.map(jnp.asarray, _logs(np.repeat(rng.normal(size=(1, 6, 2)), 4, axis=1)))
-    seq, mean = jax.tree.map(lambda a: a[0], data), 0.3 * jnp.asarray(rng.normal(size=(1, 24, 4)))
-    track = tracks(both, Gaussian(mean, jnp.zeros((1, 24, 4, 4))), jax.vmap(both.inputs)(data))
-    force = candidate_columns(both, [Candidate(law, (law,), law) for law in laws])(track).force[0]
-
-    def drive(model, x, seq, effects=()):
-        whole = with_effects(model, effects)
-        return jax.vmap(lambda x, u: whole.scene(x, u).drive)(x, whole.inputs(seq))
-
-    along, at, alone, (bare, *with_law) = jax.jit(
-        lambda x, seq: (
-            both.driving(laws[:2], x, both.inputs(seq)),
-            *(drive(model, x, seq, laws[:2]) for model in (both, torques)),
-            [drive(both, x, seq, effects) for effects in ((), *((law,) for law in laws))],
-        )
-    )(track.middle[0], seq)
-    np.testing.assert_allclose(along, at, rtol=1e-12)
-    np.testing.assert_allclose(at[:, 0], alone[:, 0], rtol=1e-12)
-    assert np.abs(force).max(axis=(1, 2)).min() > 0.1
-    np.testing.assert_allclose(force, np.stack(with_law) - np.asarray(bare), atol=1e-6)
-
-
 # --- what is declared
 
 
@@ -184,21 +149,14 @@ joints = [1, 2]
 kind = "position"
 kp = { mean = 8.0, std = 2.0 }
 delay = 0.02
-[input.goal2]
-kind = "velocity"
-kv = 0.4
-delay = { mean = 0.01, std = 0.005 }
+goal2 = { kind = "velocity", kv = 0.4, delay = { mean = 0.01, std = 0.005 } }
 """
     rig = _rig(tmp_path, text, model=ACROBOT)
     assert rig.kinds == {"goal1": "position", "goal2": "velocity"}
-    numbers = {name: value for name, value in rig.parameters.items() if name not in rig.bodies}
+    numbers = {name: (x.mean, x.std) for name, x in rig.parameters.items() if name not in rig.bodies}
     assert numbers == {
-        "goal1.kp": Declared(8.0, 2.0),
-        "goal1.delay": Declared(0.02, 0.0),
-        "goal2.kv": Declared(0.4, 0.0),
-        "goal2.delay": Declared(0.01, 0.005),
-    }
-    assert set(rig.bodies) == {"m1", "m2", "l1", "l2", "lc1", "lc2", "I1", "I2", "g"}
+        "goal1.kp": (8.0, 2.0), "goal1.delay": (0.02, 0.0), "goal2.kv": (0.4, 0.0), "goal2.delay": (0.01, 0.005),
+    }  # fmt: skip
     assert (rig.unit("goal1.kp"), rig.unit("goal2.kv"), rig.unit("goal2.delay")) == ("N m/rad", "N m s/rad", "s")
     assert "goal1 (position) on joint 1, goal2 (velocity) on joint 2" in str(rig)
     assert written_again(rig, tmp_path) == rig
@@ -206,26 +164,15 @@ delay = { mean = 0.01, std = 0.005 }
 
 def test_a_file_gives_what_rig_toml_leaves_out(tmp_path):
     rig = _of_file(tmp_path, ACTUATORS["limited"], "[input]\nkp = { mean = 10.0, std = 3.0 }")
-    assert rig.kinds == {"goal": "position"}
-    assert rig.parameters == {
-        "goal.kp": Declared(10.0, 3.0),
-        "goal.kd": Declared(0.3, 0.0),
-        "goal.limit": Declared(30.0, 0.0),
-    }
-    assert build_system(rig).gears == (-3.0,)
+    numbers = {"goal.kp": Declared(10.0, 3.0), "goal.kd": Declared(0.3, 0.0), "goal.limit": Declared(30.0, 0.0)}
+    assert (rig.kinds, rig.parameters, build_system(rig).gears) == ({"goal": "position"}, numbers, (-3.0,))
     assert written_again(rig, tmp_path) == rig
     late = _of_file(tmp_path, '<position name="goal" joint="a" kp="12" delay=".02" nsample="3"/>')
-    assert late.parameters == {
-        "goal.kp": Declared(12.0, 0.0),
-        "goal.kd": Declared(0.0, 0.0),
-        "goal.delay": Declared(0.02, 0.0),
-    }
-    rail = _of_file(tmp_path, ACTUATORS["position on a slide"])
-    assert (rail.unit("goal.kp"), rail.unit("goal.kd")) == ("N/m", "N s/m")
+    assert late.parameters["goal.delay"] == Declared(0.02, 0.0)
+    assert _of_file(tmp_path, ACTUATORS["position on a slide"]).unit("goal.kp") == "N/m"
     motor = '<motor name="goal" joint="a" gear="50"/>'  # it may be declared a servo of its joint
     rig = _of_file(tmp_path, motor, '[input]\nkind = "position"\nkp = 5.0')
     assert (rig.kinds, build_system(rig).gears) == ({"goal": "position"}, (1.0,))
-    assert written_again(rig, tmp_path) == rig
     assert build_system(_of_file(tmp_path, motor)).gears == (50.0,)
 
 
@@ -288,23 +235,6 @@ def test_what_scales_with_the_gain_and_what_friction_does_is_said(tmp_path):
     rubbed = ("goal.kd", "the learned friction of joint 1")
     assert [set(group) for group in result.together] == [{"m", "I", "goal.kp", *rubbed}]
     assert "goal.kd, the learned friction of joint 1 only in combination" in sentences(result)[0]
-    known = _servo(tmp_path, lines)  # the masses are: then the gain is told, and damping where no friction is learned
-    assert identifiability(known, build_system(known), build_servos(known)) == ((), (rubbed,))
-    bare = dataclasses.replace(known, friction=False)
-    assert identifiability(bare, build_system(bare), build_servos(bare)) == ((), ())
-
-
-def test_the_size_of_a_torque_that_nobody_logs_is_that_of_the_servo(tmp_path):
-    """RMS of kp (u - q) - kd v along a sine, behind a gear; differences over 5 rows to each side shrink it by 0.3 %."""
-    t, w = 0.01 * np.arange(629), 2.0
-    q = np.sin(w * t)[None, :, None]
-    data = _logs(1.5 * q, np.concatenate([q, 0 * q], axis=2))
-    rig = _of_file(tmp_path, ACTUATORS["behind a gear"])
-    system = build_system(rig)
-    bare = dataclasses.replace(rig, input_columns=(), input_joints=(), input_kinds=())
-    size = measure_scales(rig, system, data).torque - measure_scales(bare, system, data).torque
-    wanted = 3.0 * np.sqrt(0.5) * np.hypot(12.0 * (1.5 - 3.0), 0.3 * 3.0 * w)
-    np.testing.assert_allclose(size, [wanted, 0.0], rtol=5e-3)
 
 
 # --- numbers that are proportional to columns of the logs
@@ -368,11 +298,7 @@ def test_a_declaration_is_written_and_stored_as_it_is(tmp_path):
 
 
 BAD_LOGS = {
-    "negative": (
-        {"gain": -1.0, "at": 6},
-        r"line 8, column 'gain': found -1; goal.kp is proportional to it: write 0",
-    ),
-    "millivolts": ({"supply": 7400.0}, r"column 'supply': at most 7400, where rig.toml declares goal.kp at 7.4; write"),
+    "millivolts": ({"supply": 7400.0}, r"column 'supply': at most 7400, where rig.toml declares goal.kp at 7.4; write")
 }
 
 

@@ -91,8 +91,7 @@ class Bench(NamedTuple):
 
     rig: Rig
     train: Logs
-    test: Logs | None
-    """Only where there are any; as predictions of the reported error may see them."""
+    test: Logs | None  # Only where there are any; as predictions of the reported error may see them
 
 
 def read_bench(folder: Path, trust: bool, further: Sequence[Path] = ()) -> Bench:
@@ -117,17 +116,12 @@ def read_training(rig: Rig, folders: Sequence[Path], trust: bool) -> Logs:
     names = (folder.resolve().name for folder in folders)
     parts = {name: read_logs(place, rig, trust=trust) for name, place in zip(names, places, strict=True)}
     if len(parts) < len(folders):
-        raise DataError(
-            f"{folders[0]}: two of the folders have one name; rename one: the name of a file begins with it"
-        )
+        raise DataError(f"{folders[0]}: two folders have one name; rename one: names of files begin with it")
     return together(parts)
 
 
 def logs_of(file: Path, stored: Stored, folders: Sequence[Path], trust: bool) -> tuple[Rig, Logs]:
-    """Rig and training logs of the fit in `file`: of these folders, or of those that it names.
-
-    Raises DataError where they are not there, or are others.
-    """
+    """Rig and training logs of the fit in `file`: of these folders, or of those that it names."""
     folders = folders or list(map(Path, stored.notes.get("logs", [])))
     gone = [folder for folder in folders if not folder.is_dir()]
     if gone or not folders:
@@ -142,10 +136,7 @@ def logs_of(file: Path, stored: Stored, folders: Sequence[Path], trust: bool) ->
 
 
 def prepared(args: argparse.Namespace, file: str, log: Log) -> tuple[Bench, Stored | None]:
-    """Data set of a run that writes `file`, and the fit of --from; logs what will be replaced and where rigs differ.
-
-    Raises StoreError where a file of somebody else would be replaced.
-    """
+    """Data set of a run that writes `file`, and the fit of --from; logs what will be replaced and where rigs differ."""
     bench = read_bench(args.folder, args.trust_readings, args.more)
     warn_of_logs(args.folder, bench)
     check_own(args.out / name for name in (MODEL_FILE, "before.npz", AFTER_FILE, *REPORTS, "friction.png"))
@@ -182,10 +173,7 @@ def own_logs(args: argparse.Namespace, stored: Stored, log: Log) -> Dataset | No
 
 
 def warn_of_logs(folder: Path, bench: Bench) -> None:
-    """Warn where rates are not those of their coordinates, or inputs cannot be those of the declared bodies.
-
-    Raises DataError where rates of equations are infinite.
-    """
+    """Warn where rates are not those of their coordinates, or inputs cannot be those of the declared bodies."""
     rig, data = bench.rig, bench.train.data
     system, found = build_system(rig), list(rates(rig, data))
     if not rig.equations:
@@ -200,10 +188,7 @@ def warn_of_logs(folder: Path, bench: Bench) -> None:
 
 
 def write_states(folder: Path, logs: Logs, states: tuple[str, ...], mean, std) -> None:
-    """One file per sequence; a value that is no number becomes an empty field, with a message.
-
-    Raises StoreError, before anything is written, where a file with other columns, as a log is, would be replaced.
-    """
+    """One file per sequence; a value that is no number becomes an empty field; a log is never replaced."""
     names = ("time", *states, *(f"{name}_std" for name in states))
     paths = [(folder / file).with_suffix(".csv") for file in logs.files]
     check_own(paths, header(names))
@@ -219,10 +204,7 @@ def write_states(folder: Path, logs: Logs, states: tuple[str, ...], mean, std) -
 
 @contextmanager
 def resumable(args: argparse.Namespace, bench: Bench, log: Log) -> Iterator[Journal]:
-    """Keep every finished step of what is done inside until all of it is, and do none again that was kept.
-
-    A journal that is left `open` is kept after the end, too.  A new folder does not stay behind empty.
-    """
+    """Keep every finished step until all is done (or longer, if it is left `open`), and do none again that was kept."""
     journal, made = Journal(args.out / UNFINISHED), not args.out.exists()
     args.out.mkdir(parents=True, exist_ok=True)
     tempfile.TemporaryFile(dir=args.out).close()  # refused where it cannot be written to

@@ -42,7 +42,6 @@ def run(args: argparse.Namespace, log: Log) -> None:
 
 
 def _logs(args: argparse.Namespace, stored: Stored) -> tuple[Identified, Bench]:
-    """The logs of the fit, and the fit with the limits that their rig.toml declares now."""
     rig, train = logs_of(model_file(args.folder), stored, args.logs, args.trust_readings)
     limited = dataclasses.replace(stored.fitted.rig, limits=rig.limits)
     return stored.fitted._replace(rig=limited), Bench(limited, train, None)

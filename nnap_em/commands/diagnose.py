@@ -57,6 +57,5 @@ def run(args: argparse.Namespace, log: Log) -> int:
 
 
 def _clock(seconds: float) -> str:
-    """Time that is left, or by which it is exceeded, in minutes and seconds."""
     minutes, remainder = divmod(round(abs(seconds)), 60)
     return f"{minutes}:{remainder:02} {'left' if seconds > 0 else 'over'}"

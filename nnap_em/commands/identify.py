@@ -60,7 +60,6 @@ def smoother(args: argparse.Namespace) -> MakeSmoother:
 
 
 def _watch(rig: Rig, most: int, epochs: list[dict[str, Any]], log: Log) -> Watch:
-    """Add an entry to `epochs` and a line to the log after every epoch."""
     last = time.perf_counter()
 
     def watch(state: EMState, seen: int, used: Bool[np.ndarray, " seq"]) -> None:
@@ -82,6 +81,5 @@ def _watch(rig: Rig, most: int, epochs: list[dict[str, Any]], log: Log) -> Watch
 
 
 def _noise(rig: Rig, log_r: Float[np.ndarray, " obs"]) -> str:
-    """Estimated noise of the readings."""
     pairs = zip(rig.measured, np.exp(0.5 * log_r), strict=True)
     return ", ".join(f"{name} {std:.3g}" for name, std in pairs if name not in rig.noise_std) or "as declared"

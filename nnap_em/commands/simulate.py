@@ -41,7 +41,6 @@ def run(args: argparse.Namespace, log: Log) -> None:
 
 
 def _states(names: Sequence[str], states: Sequence[str]) -> tuple[str, ...]:
-    """The states to be read, refused where there is none of that name or one twice."""
     for name in names:
         if name not in states:
             raise DataError(f"--measured {name}: no state of this system; {nearest(name, states)}")
@@ -51,7 +50,6 @@ def _states(names: Sequence[str], states: Sequence[str]) -> tuple[str, ...]:
 
 
 def _write(folder: Path, model: StateSpaceModel, rig: Rig, experiment: Experiment, training: int) -> None:
-    """The rig, the logs, and what is true: all states, and the friction over the visited velocities."""
     write_rig(rig, folder / "rig.toml")
     system, dof = model.system, len(model.system.rates)
     for i, x in enumerate(np.asarray(experiment.x)):

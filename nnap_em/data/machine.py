@@ -17,17 +17,12 @@ class Body(NamedTuple):
     """A rigid body in its own frame, which stands in that of its parent as declared when all joints are at zero."""
 
     name: str
-    parent: int
-    """Place of the parent in the list of bodies; -1: the world."""
-    place: Vector
-    """Origin in the frame of the parent [m]."""
+    parent: int  # Place of the parent in the list of bodies; -1: the world
+    place: Vector  # Origin in the frame of the parent [m]
     turn: Rotation
-    mass: float
-    """[kg]"""
-    centre: Vector
-    """Centre of mass [m]."""
-    inertia: Rotation
-    """About the centre of mass, along the axes of the frame [kg m^2]."""
+    mass: float  # [kg]
+    centre: Vector  # Centre of mass [m]
+    inertia: Rotation  # About the centre of mass, along the axes of the frame [kg m^2]
 
 
 AXES = "xyz"
@@ -46,27 +41,17 @@ class Joint(NamedTuple):
     """A hinge or a slide, and what stands about it in the file."""
 
     name: str
-    body: int
-    """The body that it moves; several joints of one body act in the order of the list."""
+    body: int  # The body that it moves; several joints of one body act in the order of the list
     slide: bool
-    axis: Vector
-    """Unit vector in the frame of the body."""
-    anchor: Vector
-    """A point of the axis in the frame of the body [m]."""
-    zero: float
-    """Coordinate at which the body stands as declared [rad or m]."""
-    stiffness: float
-    """Stiffness of its spring [N m/rad or N/m]."""
-    rest: float
-    """Coordinate at which the spring is at rest."""
-    armature: float
-    """Inertia of what turns with it, as of a rotor [kg m^2 or kg]."""
-    damping: float
-    """[N m s/rad or N s/m]"""
-    dry: float
-    """Dry friction of the file [N m or N]."""
-    range: tuple[float, float] | None
-    """Positions of its stops."""
+    axis: Vector  # Unit vector in the frame of the body
+    anchor: Vector  # A point of the axis in the frame of the body [m]
+    zero: float  # Coordinate at which the body stands as declared [rad or m]
+    stiffness: float  # Stiffness of its spring [N m/rad or N/m]
+    rest: float  # Coordinate at which the spring is at rest
+    armature: float  # Inertia of what turns with it, as of a rotor [kg m^2 or kg]
+    damping: float  # [N m s/rad or N s/m]
+    dry: float  # Dry friction of the file [N m or N]
+    range: tuple[float, float] | None  # Positions of its stops
 
 
 class Motor(NamedTuple):
@@ -75,10 +60,8 @@ class Motor(NamedTuple):
     name: str
     joint: int
     gear: float
-    kind: str = TORQUE
-    """One of `servo.KINDS`."""
-    numbers: tuple[tuple[str, float], ...] = ()
-    """Numbers of the servo, by their keys."""
+    kind: str = TORQUE  # One of `servo.KINDS`
+    numbers: tuple[tuple[str, float], ...] = ()  # Numbers of the servo, by their keys
 
 
 class JointSensor(NamedTuple):
@@ -86,8 +69,7 @@ class JointSensor(NamedTuple):
 
     name: str
     joint: int
-    rate: bool
-    """True where it reads the velocity."""
+    rate: bool  # True where it reads the velocity
 
 
 class Site(NamedTuple):
@@ -95,23 +77,18 @@ class Site(NamedTuple):
 
     name: str
     body: int
-    place: Vector
-    """[m]"""
+    place: Vector  # [m]
 
 
 class Sensor(NamedTuple):
     """A component of a sensor at a site; its column is called as the sensor with the component behind a dot."""
 
     name: str
-    kind: str
-    """`gyro`, `accelerometer` or `framepos`; of what is not read here, MuJoCo's name for it."""
+    kind: str  # `gyro`, `accelerometer` or `framepos`; of what is not read here, MuJoCo's name for it
     axis: int
-    body: int
-    """-1: the world."""
-    place: Vector
-    """Position of the site in the frame of the body [m]."""
-    turn: Rotation
-    """Orientation of the site in the frame of the body."""
+    body: int  # -1: the world
+    place: Vector  # Position of the site in the frame of the body [m]
+    turn: Rotation  # Orientation of the site in the frame of the body
 
 
 SENSE_UNITS = {"gyro": "rad/s", "accelerometer": "m/s^2", "framepos": "m"}
@@ -122,23 +99,17 @@ class Machine(NamedTuple):
     """A tree of bodies on a fixed base."""
 
     file: str
-    gravity: Vector
-    """[m/s^2]"""
+    gravity: Vector  # [m/s^2]
     bodies: tuple[Body, ...]
     joints: tuple[Joint, ...]
     motors: tuple[Motor, ...]
     joint_sensors: tuple[JointSensor, ...]
     sites: tuple[Site, ...]
-    states: tuple[str, ...] = ()
-    """Names of the coordinates, then of the rates, in the logs."""
-    gears: tuple[float, ...] = ()
-    """Torque of a unit of every input column."""
-    motored: bool = False
-    """True where the inputs are motors of the file; False where rig.toml names joints."""
-    rubs: bool = False
-    """True where friction of the file acts, because none is learned."""
-    sensors: tuple[Sensor, ...] = ()
-    """All sensors of a file, measured ones of a rig."""
+    states: tuple[str, ...] = ()  # Names of the coordinates, then of the rates, in the logs
+    gears: tuple[float, ...] = ()  # Torque of a unit of every input column
+    motored: bool = False  # True where the inputs are motors of the file; False where rig.toml names joints
+    rubs: bool = False  # True where friction of the file acts, because none is learned
+    sensors: tuple[Sensor, ...] = ()  # All sensors of a file, measured ones of a rig
     part: tuple[tuple[str, ...] | None, tuple[tuple[str, float], ...]] | None = None
     """The joints that rig.toml names, and those that it holds with their values; None where all of the file move."""
 
@@ -151,16 +122,10 @@ def packed(machine: Machine) -> str:
 @lru_cache(maxsize=64)
 def unpacked(text: str) -> Machine:
     """The machine in a text of `packed`."""
-    kinds = {
-        "bodies": Body,
-        "joints": Joint,
-        "motors": Motor,
-        "joint_sensors": JointSensor,
-        "sites": Site,
-        "sensors": Sensor,
-    }
+    kinds = {"bodies": Body, "joints": Joint, "motors": Motor, "joint_sensors": JointSensor, "sites": Site}
     fields: dict[str, Any] = dict(zip(Machine._fields, map(_tuples, json.loads(text)), strict=True))
-    fields |= {name: tuple(kind(*one) for one in fields[name]) for name, kind in kinds.items()}
+    for name, kind in (kinds | {"sensors": Sensor}).items():
+        fields[name] = tuple(kind(*one) for one in fields[name])
     return Machine(**fields)
 
 

@@ -204,7 +204,6 @@ def read_rig(path: Path | str, systems: Mapping[str, SystemSpec]) -> Rig:
 
 
 def _declared(root: Table, spec: SystemSpec) -> Declaration:
-    """Declaration of a system of these parameters by [model] and [input]."""
     model = root.table("model")
     reserved = ("type", "friction", "actuated_joint")
     model.check(("type", "friction", *spec.parameters), ("actuated_joint", *spec.optional))
@@ -247,7 +246,6 @@ def _measurement(table: Table, spec: SystemSpec, formulas: bool) -> dict[str, An
 
 @functools.cache
 def _units(equations: str) -> dict[str, str]:
-    """Units of all names of equations."""
     of = json.loads(equations)
     return {**of["states"], **of["inputs"], **of["units"]}
 
@@ -274,7 +272,6 @@ def write_rig(rig: Rig, path: Path | str) -> None:
 
 
 def _tables(rig: Rig) -> dict[str, dict[str, Any]]:
-    """Content of rig.toml."""
     at = {name: {AT: dict(scale)} for name, scale in rig.input_scales.items()}
     numbers = {
         name: x.mean if x.std == 0 and name not in at else dataclasses.asdict(x) | at.get(name, {})

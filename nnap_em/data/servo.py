@@ -12,14 +12,10 @@ TORQUE = "torque"
 class Key(NamedTuple):
     """A number of a servo."""
 
-    unit: str
-    """Unit on a rotary joint."""
-    needed: bool = False
-    """True where no servo is one without it."""
-    least: float | None = None
-    """The smallest value that is possible; None: any."""
-    open: bool = False
-    """True where the smallest value itself is not possible."""
+    unit: str  # Unit on a rotary joint
+    needed: bool = False  # True where no servo is one without it
+    least: float | None = None  # The smallest value that is possible; None: any
+    open: bool = False  # True where the smallest value itself is not possible
 
 
 def _gain(unit: str) -> Key:
@@ -57,11 +53,9 @@ class Inputs(NamedTuple):
     """The table [input]."""
 
     columns: tuple[str, ...]
-    joints: tuple[int, ...]
-    """The joint that each drives, counted from 1."""
+    joints: tuple[int, ...]  # The joint that each drives, counted from 1
     drives: Mapping[str, Drive] = {}
-    motored: bool = False
-    """True where they are the motors of a machine file."""
+    motored: bool = False  # True where they are the motors of a machine file
 
     @property
     def kinds(self) -> tuple[str, ...]:
@@ -121,7 +115,6 @@ def read_inputs(
 
 
 def _joints(table: Table, names: Sequence[str], count: int) -> list[int]:
-    """Numbers of the joints that a table names."""
     given = table.value("joints")
     if not isinstance(given, list):
         table.refuse("joints")
@@ -157,7 +150,6 @@ def _drive(table: Table, column: str, of_file: Drive) -> Drive:
 
 
 def _number(table: Table, key: str, about: Key) -> Declared:
-    """A number that such a drive can have."""
     value = table.quantity(key, (AT,))
     if about.least is not None and (value.mean < about.least or (about.open and value.mean == about.least)):
         bound = f"a number above {about.least:g}" if about.open else f"{about.least:g} or more"

@@ -172,7 +172,7 @@ def every(reads: Mapping[str, Callable[[], Any]]) -> dict[str, Any]:
 def nearest(word: str, known: Collection[str]) -> str:
     """The remedy for a misspelt name: the known name nearest to it, then all that are possible."""
     same = [name for name in known if name.casefold() == word.strip().casefold()]
-    close = same or difflib.get_close_matches(word, known, n=1)
+    close = same or difflib.get_close_matches(word, known, n=1, cutoff=0.5)
     question = f"did you mean {close[0]!r}? " if close else ""
     return f"{question}possible here: {', '.join(known) or 'none'}"
 

@@ -68,26 +68,20 @@ class Draft(NamedTuple):
 class Meaning(NamedTuple):
     """Meaning of the name of a column."""
 
-    kind: str
-    """`time`, `input`, the name of a state, or nothing."""
+    kind: str  # `time`, `input`, the name of a state, or nothing
     number: int | None
-    unit: str
-    """Unit by the name where it is not SI."""
+    unit: str  # Unit by the name where it is not SI
 
 
 def draft(path: Path, system: str | None, specs: Mapping[str, SystemSpec]) -> Draft:
-    """The rig.toml for a log of a built-in machine; `system` where its names do not show it.
-
-    Raises DataError where the log cannot be read, or nothing in it looks like a machine.
-    """
+    """The rig.toml for a log of a built-in machine; `system` where its names do not show it."""
     topics = reader(path).topics(path)
     states, inputs = found_columns(topics)
     if not states and not inputs:
-        every = [str(at) for at, _ in places(topics)]
-        names = ", ".join(topic.name for topic in topics if topic.name) or ", ".join(every[:12]) or "none"
-        hint = f"write rig.toml by hand, with [import.columns] such as theta1 = {toml_text((*every, 'topic:field')[0])}"
+        fields = [str(at) for at, _ in places(topics)] or ["topic:field"]
+        hint = f"write rig.toml by hand, with [import.columns] such as theta1 = {toml_text(fields[0])}"
         hint = (path.suffix.lower() == ".csv" and header_hint(path)) or hint
-        raise DataError(f"{path}: nothing looks like joints or torques (found {names}); {hint}")
+        raise DataError(f"{path}: nothing looks like joints or torques (found {', '.join(fields[:12])}); {hint}")
     system = system or _system(path, states, inputs, specs)
     spec = specs[system]
     driven = {name: (at, spec.driven if joint is None else joint) for name, (at, joint) in inputs.items()}
@@ -184,7 +178,6 @@ def commands(topics: Sequence[Topic]) -> list[Address]:
 
 
 def _system(path: Path, states: Iterable[str], inputs: Mapping[str, tuple], specs: Mapping[str, SystemSpec]) -> str:
-    """The system that the names call for."""
     kinds = {*states}
     slides, angles = kinds & {"x", "dx"}, any("theta" in kind for kind in kinds)
     if slides and not angles:
@@ -269,7 +262,6 @@ def sampling(table: Mapping[str, np.ndarray]) -> Iterator[str]:
 def _measurement(
     table: Mapping[str, np.ndarray], measured: Sequence[str], states: Sequence[str], unit: Callable[[str], str]
 ) -> Iterator[str]:
-    """Tables of readings, their noise, and the state in the first row."""
     known = ", ".join(map(toml_text, states))
     names = f"[{', '.join(map(toml_text, measured))}]"
     yield from ("", "[measurement]")

@@ -14,10 +14,7 @@ from .draft import HEAD, Draft, columns_table, meaning, sampling
 
 
 def draft_equations(path: Path) -> Draft:
-    """The rig.toml for a CSV log, with one state for each reading and rates to be written.
-
-    Raises DataError where the log cannot be read.
-    """
+    """The rig.toml for a CSV log, with one state for each reading and rates to be written."""
     names = [Address(topic.name, field) for topic in reader(path).topics(path) for field in topic.fields]
     if not names:
         raise DataError(f"{path}: holds no column beside the time; give a log with inputs and readings")

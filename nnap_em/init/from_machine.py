@@ -17,10 +17,7 @@ from .draft import COMMAND, Draft, commands, drafted, driven, meanings
 
 
 def draft_machine(path: Path, model: Path, home: Path) -> Draft:
-    """The rig.toml in the folder `home` for the log `path` of the machine in `model`.
-
-    Raises DataError where the log cannot be read or no joint of the machine is in it, MachineError for `model`.
-    """
+    """The rig.toml in the folder `home` for the log `path` of the machine in `model`."""
     topics = reader(path).topics(path)
     words = {word for _, field in places(topics) for word in re.split(r"[][]", field)}
     held = stuck(model, words)
@@ -50,7 +47,6 @@ def draft_machine(path: Path, model: Path, home: Path) -> Draft:
 
 
 def _first(fields: Sequence[tuple[Address, str]], names: Sequence[str]) -> Address | None:
-    """Address of the first name that exists."""
     return next((at for name in names for at, word in fields if word == name), None)
 
 
@@ -77,10 +73,7 @@ def _kinds(topics: Sequence[Topic]) -> dict[str, Address]:
 
 
 def _inputs(machine: Machine, topics: Sequence[Topic]) -> dict[str, tuple[Address, str]]:
-    """Columns of torques, where they are, and the joint of each: of the motors, or of joints where there are none.
-
-    A measured effort is the torque of a motor, and no command of a servo.
-    """
+    """Columns of torques, where they are, and the joint of each; a measured effort is no command of a servo."""
     fields, order = places(topics), commands(topics)
     kinds, servos = _kinds(topics), {motor.name for motor in machine.motors if motor.kind != TORQUE}
     motors = [(motor.name, machine.joints[motor.joint].name) for motor in machine.motors]
@@ -116,7 +109,6 @@ def _model(machine: Machine, file: str, held: Mapping[str, float]) -> Iterator[s
 
 
 def _driven(machine: Machine, joints: Mapping[str, str]) -> Iterator[str]:
-    """The inputs; no lines where they are the motors of the file."""
     if not machine.motors or len(joints) != len(machine.motors):
         yield from driven(joints, joints=not machine.motors)
         return

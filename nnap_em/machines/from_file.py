@@ -68,7 +68,6 @@ def _gear(motor: Motor | None, drive: Drive) -> float:
 
 
 def _part(model: Table) -> Part:
-    """The joints of `[model] joints`, and the values of `[model] locked`."""
     joints = model.items.get("joints")
     if joints is not None:
         if not (isinstance(joints, list) and joints and all(type(name) is str for name in joints)):
@@ -81,7 +80,6 @@ def _part(model: Table) -> Part:
 
 
 def _sensors(machine: Machine, table: Table, columns: Collection[str]) -> tuple[Sensor, ...]:
-    """The components of sensors that are measured."""
     for column in columns:
         for sensor in machine.sensors:
             own = sensor.name.rpartition(".")[0] in (column, str(column).rpartition(".")[0])
@@ -92,7 +90,6 @@ def _sensors(machine: Machine, table: Table, columns: Collection[str]) -> tuple[
 
 
 def _parameters(machine: Machine, model: Table) -> dict[str, Declared]:
-    """Every number of [model.uncertain], its mean that of the file where none is written."""
     table = model.table("uncertain", absent={}).flattened()
     bodies = {body.name: dict(zip(OF_BODY, of_body(body), strict=True)) for body in machine.bodies}
     owners = {joint.name: {what: float(getattr(joint, what)) for what in OF_JOINT} for joint in machine.joints}
@@ -118,7 +115,6 @@ def _parameters(machine: Machine, model: Table) -> dict[str, Declared]:
 
 
 def _check_inertia(table: Table, body: str, values: dict[str, float]) -> None:
-    """Raise RigError unless some distribution of mass has the declared inertia."""
     inertia = np.empty((3, 3))
     for (i, j), what in zip(PAIRS, OF_BODY[4:], strict=True):
         inertia[i, j] = inertia[j, i] = values[what]

@@ -10,10 +10,8 @@ from .spec import mujoco
 class Part(NamedTuple):
     """The joints of a file that move, and the values at which others are held."""
 
-    joints: tuple[str, ...] | None = None
-    """The joints that move; none given: all that are not held."""
-    locked: Mapping[str, float] = MappingProxyType({})
-    """Values of joints that are held [rad or m]."""
+    joints: tuple[str, ...] | None = None  # The joints that move; none given: all that are not held
+    locked: Mapping[str, float] = MappingProxyType({})  # Values of joints that are held [rad or m]
 
     @property
     def whole(self) -> bool:

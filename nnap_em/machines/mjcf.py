@@ -37,14 +37,7 @@ def read_file(path: Path, part: Part = _WHOLE) -> MachineFile:
     spec = opened(path)
     if not part.whole:
         _hold(path, spec, part)
-    model = weightless(path, spec)
-    _refuse_all(path, model, _WHOLE)
-    mass = np.bincount(model.body_weldid, model.body_mass)
-    for j in range(model.njnt):
-        if mass[model.jnt_bodyid[j]] <= NOTHING:
-            hint = "give it an <inertial> with mass and inertia (shapes of URDF weigh nothing)"
-            hint += f", or hold its joint: {holding(model.joint(j).name)}"
-            refuse(path, f"body {model.body(model.jnt_bodyid[j]).name!r} moves and has no mass", hint)
+    _refuse_all(path, weightless(path, spec), _WHOLE)
     model = compiled(path, spec)
     machine = _machine(path, model)
     _refuse_names(path, machine)
@@ -83,7 +76,6 @@ def _machine(path: Path, model: Any) -> Machine:
 
 
 def _hold(path: Path, spec: Any, part: Part) -> None:
-    """Free `spec` of the joints that are held."""
     model = weightless(path, spec)
     names = [model.joint(j).name for j in range(model.njnt)]
     for key, declared in (("joints", part.joints or ()), ("locked", part.locked)):
@@ -124,7 +116,6 @@ def _couplings(model: Any) -> dict[str, tuple[str, Callable[[float], float]]]:
 
 
 def _refuse_all(path: Path, model: Any, part: Part) -> None:
-    """Raise MachineError at the first obstacle, with its remedy."""
     held = {j for j in range(model.njnt) if part.holds(model.joint(j).name)}
     for j in sorted({*range(model.njnt)} - held):
         name, kind = model.joint(j).name or f"number {j + 1}", _kind("mjtJoint", model.jnt_type[j])
@@ -177,7 +168,6 @@ def _closed(model: Any, held: set[int]) -> Iterator[set[int]]:
 
 
 def _above(model: Any, body: int) -> set[int]:
-    """Joints that move a body."""
     first = int(model.body_jntadr[body])
     own = {*range(first, first + int(model.body_jntnum[body]))}
     return own | _above(model, int(model.body_parentid[body])) if body else set()
@@ -321,7 +311,6 @@ def _limits(model: Any, i: int) -> tuple[float, float] | None:
 
 
 def _sensors(model: Any) -> Iterator[Sensor]:
-    """The components of every sensor that reads no joint."""
     for i in range(model.nsensor):
         kind, at = _kind("mjtSensor", model.sensor_type[i]), -1
         if kind in ("jointpos", "jointvel"):

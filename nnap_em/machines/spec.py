@@ -23,10 +23,7 @@ def refuse(path: Path, problem: str, hint: str) -> NoReturn:
 
 
 def mujoco() -> Any:
-    """The parser, an extra of the package.
-
-    Raises MachineError where it is not installed.
-    """
+    """The parser, an extra of the package; MachineError where it is not installed."""
     try:
         import mujoco
     except ImportError:
@@ -37,10 +34,7 @@ def mujoco() -> Any:
 
 
 def opened(path: Path) -> Any:
-    """The content of an MJCF or URDF file as an MjSpec; a link of a URDF file without an inertial weighs nothing.
-
-    Warns of what MuJoCo warns of.  Raises MachineError at macros that are not expanded, and at what its parser refuses.
-    """
+    """The content of an MJCF or URDF file as an MjSpec; a link of a URDF file without an inertial weighs nothing."""
     parser, heard, text = mujoco(), [], uncommented(path)
     unread = r"(?s)<(visual|collision|gazebo|ros2_control)\b.*?</\1>"  # of which no number is read
     macros = re.sub(unread, lambda part: "\n" * part[0].count("\n"), text)
@@ -73,10 +67,7 @@ def uncommented(path: Path) -> str:
 
 
 def compiled(path: Path, spec: Any) -> Any:
-    """MuJoCo's model; where files of textures or shapes are missing, `spec` loses these.
-
-    Raises MachineError at what the compiler refuses, and where a mesh is missing that a body takes its mass from.
-    """
+    """MuJoCo's model; where files of textures or shapes are missing, `spec` loses these, but no mesh that has mass."""
     for without in (_without_textures, _without_meshes, None):
         try:
             return spec.compile()
@@ -143,8 +134,9 @@ def _without_meshes(path: Path, spec: Any) -> None:
 def _refuse(path: Path, error: Exception) -> NoReturn:
     """Raise MachineError with the message of MuJoCo, which has a line where it reads the file."""
     message = re.sub(r", line (-1|0)\b", "", " ".join(str(error).split()))
-    hint = "correct the file: bodies form a tree on a fixed base, each that moves has mass and inertia above 0, "
-    hint += "the largest part of an inertia is at most the sum of the others, and names are different"
+    hint = "correct the file: bodies form a tree on a fixed base, the largest part of an inertia is at most the sum of "
+    hint += "the others, names are different, and each body that moves has an <inertial> above 0 (shapes of URDF weigh "
+    hint += "nothing), or its joint is held: [model] locked = { JOINT = 0.0 }"
     refuse(path, f"MuJoCo's compiler refuses it: {message}", hint)
 
 

@@ -37,10 +37,9 @@ def spec(system: type[AbstractSystem], driven: int = 1) -> SystemSpec:
 
 specs: dict[str, SystemSpec] = {name: spec(system) for name, system in systems.items()}
 specs["acrobot"] = spec(acrobot.Acrobot, *acrobot.drives)
-systems["mjcf"] = tree.Tree
-specs["mjcf"] = SystemSpec((), (), {}, 0, declare=declare)  # the file names states and parameters
-systems["equations"] = equations.Equations
-specs["equations"] = SystemSpec((), (), {}, 0, declare=declared.declare)
+systems |= {"mjcf": tree.Tree, "equations": equations.Equations}  # whose files name states and parameters
+specs |= {"mjcf": SystemSpec((), (), {}, 0, declare=declare)}
+specs |= {"equations": SystemSpec((), (), {}, 0, declare=declared.declare)}
 
 
 def read_rig(path: Path | str) -> Rig:
@@ -103,10 +102,8 @@ def register_equations(
     Raises:
         ValueError: the name is taken.
     """
-    if (
-        equations.functions.get(name, rate) is not rate
-        or systems.get(name, equations.Equations) is not equations.Equations
-    ):
+    known = equations.functions.get(name, rate), systems.get(name, equations.Equations)
+    if known != (rate, equations.Equations):
         raise ValueError(f"{name!r} is taken; give the equations another name")
     of = equations.Text(dict(states), dict(inputs), {}, {}, tuple(parameters), units=dict(units or {}), function=name)
     equations.functions[name], systems[name] = rate, equations.Equations

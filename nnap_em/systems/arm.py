@@ -42,24 +42,17 @@ class TwoLinkArm(AbstractSystem):
         ("center_of_mass", 2): (lambda arm, dlc: replace(arm, lc2=arm.lc2 + dlc), lambda arm: arm.l2),
     }
 
-    m1: Scalar
-    """Mass of link 1 [kg]."""
+    m1: Scalar  # Mass of link 1 [kg]
     m2: Scalar
-    l1: Scalar
-    """Length of link 1 [m]."""
+    l1: Scalar  # Length of link 1 [m]
     l2: Scalar
-    lc1: Scalar
-    """Distance of the centre of mass of link 1 from its joint [m]."""
+    lc1: Scalar  # Distance of the centre of mass of link 1 from its joint [m]
     lc2: Scalar
-    I1: Scalar
-    """Inertia of link 1 about its centre of mass [kg m^2]."""
+    I1: Scalar  # Inertia of link 1 about its centre of mass [kg m^2]
     I2: Scalar
-    g: Scalar
-    """Gravity [m/s^2]."""
-    Ir: Scalar
-    """Rotor inertia of both drives [kg m^2]."""
-    gr: Scalar
-    """Gear ratio of both drives [-]."""
+    g: Scalar  # Gravity [m/s^2]
+    Ir: Scalar  # Rotor inertia of both drives [kg m^2]
+    gr: Scalar  # Gear ratio of both drives [-]
     joints: tuple[int, ...] = eqx.field(static=True)
 
     def mass(self, q: Float[Array, " dof"]) -> Float[Array, "dof dof"]:

@@ -31,10 +31,7 @@ def numbers(body: Body, values: Mapping[str, Scalar]) -> tuple[Scalar, Three, Tu
 def carried_by(
     machine: Machine, layout: Layout, values: Mapping[str, Scalar], loads: Mapping[int, Inertia]
 ) -> list[Inertia]:
-    """Body that the frame of every joint carries; no number where a body is not physical, so that no fit goes there.
-
-    `loads`, by place of the body, are added to the bodies.
-    """
+    """Body with its load that each joint's frame carries; no number where it is not physical: no fit goes there."""
     inertias = [NO_INERTIA] * len(layout.frames)
     for place, (body, mount) in enumerate(zip(machine.bodies, layout.mounts, strict=True)):
         if mount.joint < 0:
@@ -54,8 +51,7 @@ def mounted(mass: Scalar, centre: Three, tensor: Turn, mount: Mount) -> Inertia:
 
 
 def physical(mass: Scalar, tensor: Turn) -> Any:
-    """True where some distribution of mass has this inertia: half its trace less itself is positive, and so is the
-    mass.
+    """True where some distribution of mass has this inertia: half its trace less itself, and the mass, are positive.
 
     [Wensing, Kim & Slotine 2018, IEEE RA-L 3(1), eq. 12: the pseudo-inertia]  By leading minors, with a margin.
     """
@@ -92,14 +88,10 @@ def _together(mass: Scalar, centre: Three, tensor: Turn) -> Numbers:
 class LoadPoint(NamedTuple):
     """Place of a candidate load on the body of a joint, and its typical size."""
 
-    body: int
-    """Place of the body among all."""
-    point: tuple[float, float, float]
-    """Point of a load without a first moment, in the frame of the body [m]."""
-    mass: float
-    """Mean mass of a moving body [kg]."""
-    length: float
-    """Longest distance from a joint to what it carries [m]."""
+    body: int  # Place of the body among all
+    point: tuple[float, float, float]  # Point of a load without a first moment, in the frame of the body [m]
+    mass: float  # Mean mass of a moving body [kg]
+    length: float  # Longest distance from a joint to what it carries [m]
 
 
 def spots(machine: Machine, layout: Layout) -> dict[int, LoadPoint]:

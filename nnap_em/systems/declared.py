@@ -65,37 +65,29 @@ def _named(model: Table, key: str, had: Mapping[str, str]) -> dict[str, str]:
 
 
 def _unit(table: Table, name: str) -> str:
-    """The unit of a name."""
     unit = table.items[name]
     if not isinstance(unit, str) or not unit:
-        table.refuse(
-            name, f"missing unit (found {unit!r})", f'write its unit, {name} = "V", or for all names alone, ["{name}"]'
-        )
+        hint = f'write its unit, {name} = "V", or for all names alone, ["{name}"]'
+        table.refuse(name, f"missing unit (found {unit!r})", hint)
     return unit
 
 
 def _distinct(model: Table, *parts: Collection[str]) -> None:
-    """Refuse names that are no names, that formulas use otherwise, and names that stand twice."""
     seen: set[str] = set()
     for name in (name for part in parts for name in part):
         if not name.isidentifier() or name in (*FUNCTIONS, "time"):
             model.refuse(name, f"{name!r} cannot be a name in a formula", "use letters, digits and _, but no function")
         if name in seen:
-            model.refuse(
-                name, "this name stands twice", "give states, inputs, parameters and unknown terms names of their own"
-            )
+            model.refuse(name, "this name stands twice", "give states, inputs, parameters and terms names of their own")
         seen.add(name)
 
 
 def _rates(model: Table, states: Collection[str], known: Collection[str]) -> dict[str, Formula]:
-    """The formula of every state."""
     rates = model.table("rates")
-    for name in rates.items:
-        if name not in states:
-            rates.refuse(name, "a rate of no state", nearest(name, states))
     for name in states:
         if name not in rates.items:
             rates.refuse(name, "a state without rate", f'write {name} = "..." , its derivative by time [1/s]')
+    rates.check((), states)
     return every({name: partial(_formula, rates, name, known) for name in states})
 
 
@@ -112,7 +104,6 @@ def _formula(table: Table, key: str, known: Collection[str]) -> Formula:
 
 
 def _readings(measurement: Table, states: Collection[str], known: Collection[str]) -> dict[str, Formula]:
-    """Formulas of the columns that are no states."""
     columns = measurement.value("columns")
     if not isinstance(columns, Mapping):
         for name in columns if isinstance(columns, list) else ():
@@ -124,9 +115,7 @@ def _readings(measurement: Table, states: Collection[str], known: Collection[str
     formulas = every({name: partial(_formula, table, name, known) for name in table.items})
     for name, formula in formulas.items():
         if name in states and formula.text != name:
-            table.refuse(
-                name, "a column with the name of a state, but another formula", "name the state or the column otherwise"
-            )
+            table.refuse(name, "called as a state, but of another formula", "name the state or the column otherwise")
     return {name: formula for name, formula in formulas.items() if name not in states}
 
 
@@ -145,7 +134,6 @@ def _term(unknown: Table, name: str, states: Collection[str], inputs: Collection
 
 
 def _used(table: Table, formulas: Collection[Formula], names: Collection[str]) -> None:
-    """Refuse names that no formula has."""
     used = {name for formula in formulas for name in formula.names}
     for name in names:
         if name not in used:

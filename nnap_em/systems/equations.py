@@ -20,22 +20,16 @@ from .plant import AbstractPlant, Scalar
 class Text(NamedTuple):
     """Equations as they are declared; `packed` is the same in one line."""
 
-    states: dict[str, str]
-    """States and their units."""
+    states: dict[str, str]  # States and their units
     inputs: dict[str, str]
-    rates: dict[str, str]
-    """Formula of the derivative of every state; empty where a Python function has them."""
-    readings: dict[str, str]
-    """Formula of every column that is no state."""
+    rates: dict[str, str]  # Formula of the derivative of every state; empty where a Python function has them
+    readings: dict[str, str]  # Formula of every column that is no state
     parameters: tuple[str, ...]
-    terms: Mapping[str, tuple[str, ...]] = {}
-    """Unknown terms that stand in formulas by their names, and their signals."""
+    terms: Mapping[str, tuple[str, ...]] = {}  # Unknown terms that stand in formulas by their names, and their signals
     enters: Mapping[str, tuple[str, tuple[str, ...]]] = {}
     """Unknown terms that are added to the rate of a state: the state, and their signals."""
-    units: Mapping[str, str] = {}
-    """Units of parameters and readings, as far as they are declared."""
-    function: str = ""
-    """Name of the Python function."""
+    units: Mapping[str, str] = {}  # Units of parameters and readings, as far as they are declared
+    function: str = ""  # Name of the Python function
 
     @property
     def packed(self) -> str:
@@ -57,7 +51,6 @@ def unpacked(text: str) -> Text:
 
 @functools.cache
 def _formulas(text: str) -> tuple[tuple[Formula, ...], tuple[Formula, ...]]:
-    """Rates in the order of the states, and readings."""
     of = unpacked(text)
     known = (*of.states, *of.inputs, *of.parameters, *of.terms)
     rates = tuple(parse(of.rates[name], known) for name in of.states) if of.rates else ()
@@ -73,14 +66,11 @@ class Equations(AbstractPlant):
     """x' = f(x, u, p) + push, y = g(x, u, p); an unknown term is a port whose push stands where its name does."""
 
     simulated: ClassVar[bool] = True
-    given: ClassVar[float] = 0.25
-    """Two slowest time constants determine a start."""
+    given: ClassVar[float] = 0.25  # Two slowest time constants determine a start
     joints: ClassVar[tuple[int, ...]] = ()
 
-    values: dict[str, Float[Array, ""]]
-    """Parameters."""
-    text: str = eqx.field(static=True)
-    """`Text.packed`."""
+    values: dict[str, Float[Array, ""]]  # Parameters
+    text: str = eqx.field(static=True)  # `Text.packed`
 
     @classmethod
     def declared(cls, parameters: Mapping[str, Array], joints: tuple[int, ...], text: str) -> "Equations":

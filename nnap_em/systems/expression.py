@@ -2,7 +2,7 @@
 
 import ast
 from collections.abc import Callable, Collection, Mapping
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, NoReturn
 
 import jax.numpy as jnp
 
@@ -55,10 +55,7 @@ class Formula(NamedTuple):
 
 
 def parse(text: str, known: Collection[str]) -> Formula:
-    """The formula of a text in `known` names: + - * / ^, comparisons in `where`, and `FUNCTIONS`.
-
-    Raises FormulaError at the first mistake.
-    """
+    """The formula of a text in `known` names: + - * / ^, comparisons in `where`, and `FUNCTIONS`."""
     try:
         tree = ast.parse(text.replace("^", "**"), mode="eval").body
     except SyntaxError as error:
@@ -66,14 +63,13 @@ def parse(text: str, known: Collection[str]) -> Formula:
         raise FormulaError(f"{place}: not a formula; write such as k * sqrt(h)") from None
     names: dict[str, None] = {}
 
-    def refuse(node: ast.AST, problem: str, hint: str) -> None:
+    def refuse(node: ast.AST, problem: str, hint: str) -> NoReturn:
         raise FormulaError(f"{_mark(text, getattr(node, 'col_offset', 0))}: {problem}; {hint}")
 
     def built(node: ast.AST) -> Callable[[Values], Any]:
+        function, parts = None, []
         match node:
-            case ast.Constant(value=bool() | str()):
-                refuse(node, f"{node.value!r} is no number", "write numbers and names")
-            case ast.Constant(value=int() | float() as value):
+            case ast.Constant(value=int() | float() as value) if not isinstance(value, bool):
                 number = float(value)
                 return lambda values: number
             case ast.Name(id=name) if name in known:
@@ -81,24 +77,20 @@ def parse(text: str, known: Collection[str]) -> Formula:
                 return lambda values: values[name]
             case ast.Name(id=name):
                 refuse(node, f"unknown name {name!r}", nearest(name, known))
-            case ast.UnaryOp(op=op, operand=one) if type(op) in _OPERATORS:
-                operate, first = _OPERATORS[type(op)], built(one)
-                return lambda values: operate(first(values))
-            case ast.BinOp(op=o, left=a, right=b) | ast.Compare(left=a, ops=[o], comparators=[b]) if (
-                type(o) in _OPERATORS
-            ):
-                operate, first, second = _OPERATORS[type(o)], built(a), built(b)
-                return lambda values: operate(first(values), second(values))
-            case ast.Call(func=ast.Name(id=name), args=arguments, keywords=[]):
-                if name not in FUNCTIONS:
+            case ast.UnaryOp(op=op, operand=a):
+                function, parts = _OPERATORS.get(type(op)), [a]
+            case ast.BinOp(op=op, left=a, right=b) | ast.Compare(left=a, ops=[op], comparators=[b]):
+                function, parts = _OPERATORS.get(type(op)), [a, b]
+            case ast.Call(func=ast.Name(id=name), args=parts, keywords=[]):
+                count, function = FUNCTIONS.get(name, (len(parts), None))
+                if function is None:
                     refuse(node, f"unknown function {name!r}", nearest(name, FUNCTIONS))
-                count, function = FUNCTIONS[name]
-                if len(arguments) != count:
-                    refuse(node, f"{name} takes {count} arguments, found {len(arguments)}", "correct it")
-                parts = [built(one) for one in arguments]
-                return lambda values: function(*(part(values) for part in parts))
-        refuse(node, f"{type(node).__name__} is not part of formulas", f"use + - * / ^ and {', '.join(FUNCTIONS)}")
-        raise AssertionError  # `refuse` raises
+                if len(parts) != count:
+                    refuse(node, f"{name} takes {count} arguments, found {len(parts)}", "correct it")
+        if function is None:
+            refuse(node, f"{type(node).__name__} is not part of formulas", f"use + - * / ^ and {', '.join(FUNCTIONS)}")
+        inner = [built(one) for one in parts]
+        return lambda values: function(*(part(values) for part in inner))
 
     of = built(tree)
     return Formula(text, tuple(names), of)

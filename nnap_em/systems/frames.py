@@ -13,10 +13,8 @@ from .spatial import Three, Turn
 class Frame(NamedTuple):
     """The frame of a joint in that of the joint before it, at coordinate zero: its z is the axis of the joint."""
 
-    before: int
-    """The joint that carries it; -1: the base."""
-    place: Three
-    """[m]"""
+    before: int  # The joint that carries it; -1: the base
+    place: Three  # [m]
     turn: Turn
     slide: bool
 
@@ -24,8 +22,7 @@ class Frame(NamedTuple):
 class Mount(NamedTuple):
     """Place of a body: the joint whose frame carries it, and its own frame in there."""
 
-    joint: int
-    """-1: the base."""
+    joint: int  # -1: the base
     place: Three
     turn: Turn
 
@@ -33,10 +30,8 @@ class Mount(NamedTuple):
 class Layout(NamedTuple):
     """Structure of a machine."""
 
-    frames: tuple[Frame, ...]
-    """Frames of every joint."""
-    mounts: tuple[Mount, ...]
-    """Mounts of every body."""
+    frames: tuple[Frame, ...]  # Frames of every joint
+    mounts: tuple[Mount, ...]  # Mounts of every body
 
 
 @lru_cache(maxsize=64)

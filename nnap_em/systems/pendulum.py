@@ -24,10 +24,8 @@ class Pendulum(AbstractSystem):
         ("center_of_mass", 1): (lambda rod, dlc: replace(rod, lc=rod.lc + dlc), lambda rod: rod.lc),
     }
 
-    m: Float[Array, ""]
-    """Mass [kg]."""
-    lc: Float[Array, ""]
-    """Distance of the centre of mass from the joint [m]."""
+    m: Float[Array, ""]  # Mass [kg]
+    lc: Float[Array, ""]  # Distance of the centre of mass from the joint [m]
     I: Float[Array, ""]  # noqa: E741  (the field's own symbol)
     """Inertia about the centre of mass [kg m^2]."""
     g: Float[Array, ""]

@@ -15,12 +15,9 @@ from jaxtyping import Array, Float
 class Numbers(NamedTuple):
     """Numbers of a body, in its own frame."""
 
-    mass: Float[Array, ""]
-    """[kg]"""
-    centre: Float[Array, "3"]
-    """[m]"""
-    inertia: Float[Array, "3 3"]
-    """About the centre [kg m^2]."""
+    mass: Float[Array, ""]  # [kg]
+    centre: Float[Array, "3"]  # [m]
+    inertia: Float[Array, "3 3"]  # About the centre [kg m^2]
 
 
 def pseudo(body: Numbers) -> Float[Array, "4 4"]:

@@ -32,12 +32,9 @@ from .spatial import (
 class Inertia(NamedTuple):
     """Inertia of a rigid body about the origin of its frame."""
 
-    mass: Scalar
-    """[kg]"""
-    moment: Three
-    """Mass times the centre of mass [kg m]."""
-    second: Turn
-    """[kg m^2]"""
+    mass: Scalar  # [kg]
+    moment: Three  # Mass times the centre of mass [kg m]
+    second: Turn  # [kg m^2]
 
 
 class Pose(NamedTuple):
@@ -51,12 +48,9 @@ class Pose(NamedTuple):
 class Motion(NamedTuple):
     """Motion of a joint's frame, in its own axes."""
 
-    spin: Three
-    """Angular velocity [rad/s]."""
-    turns: Three
-    """Angular acceleration [rad/s^2]."""
-    rise: Three
-    """Acceleration of its origin against free fall [m/s^2]."""
+    spin: Three  # Angular velocity [rad/s]
+    turns: Three  # Angular acceleration [rad/s^2]
+    rise: Three  # Acceleration of its origin against free fall [m/s^2]
 
 
 NO_INERTIA = Inertia(0.0, ZERO, (ZERO, ZERO, ZERO))

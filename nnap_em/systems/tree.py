@@ -31,10 +31,8 @@ class Tree(AbstractSystem):
     coordinates: tuple[str, ...] = eqx.field(static=True)
     rates: tuple[str, ...] = eqx.field(static=True)
     angles: tuple[bool, ...] = eqx.field(static=True)
-    text: str = eqx.field(static=True)
-    """The compiled file, as `packed` writes it."""
-    values: dict[str, Float[Array, ""]]
-    """Numbers that are not the file's, under their names in `[model.uncertain]`."""
+    text: str = eqx.field(static=True)  # The compiled file, as `packed` writes it
+    values: dict[str, Float[Array, ""]]  # Numbers that are not the file's, under their names in `[model.uncertain]`
     joints: tuple[int, ...] = eqx.field(static=True)
     loads: dict[int, Inertia] = eqx.field(default_factory=dict)
     """Loads of bodies beside their own mass, by their place, about the origins of their frames."""

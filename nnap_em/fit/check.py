@@ -18,7 +18,6 @@ from ..data.servo import TORQUE
 from ..em.build import LAG, NO_MACHINE, Scales, build_system, measure_scales
 from ..em.equations import infinite_rates, motion
 from ..em.readings import onset
-from ..em.scale import not_identifiable
 from ..em.servos import build_servos, steps_of_sample
 from ..em.simulated import filter_path, windows
 from ..model.base import prepare
@@ -28,7 +27,7 @@ from ..numerics.digits import counted
 from ..numerics.parallel import each
 from ..smoother.posterior import AbstractSmoother
 from ..systems import AbstractSystem
-from .identifiability import identifiability, sentences
+from .identifiability import identifiability, not_identifiable, sentences
 from .identify import Identified, begin
 from .inverse_dynamics import UNEXPLAINED, Lag, explanations, gains, lag, mistakes, regression
 from .rates import bridged, timing

@@ -49,8 +49,8 @@ def _begun() -> Identified:
 
 @functools.cache
 def _case(q: float, information: float) -> _Case:
-    """A pendulum whose model is the truth, with rate kicks of std `q`; its friction is known as before any log, in
-    units of that precision.
+    """A pendulum whose model is the truth, with rate kicks of std `q`; its mass is known, its friction as before any
+    log, in units of that precision.
     """
     system = Pendulum(**{k: jnp.asarray(v) for k, v in PHYSICS.items()}, joints=(1,))
     start = Gaussian(jnp.zeros(2), jnp.diag(jnp.asarray([1.5, 3.0]) ** 2))
@@ -59,7 +59,7 @@ def _case(q: float, information: float) -> _Case:
     unknown = eqx.tree_at(lambda f: (f.speed, f.knee), problem.model.unknown, (jnp.asarray([8.0]), jnp.asarray([0.1])))
     model = StateSpaceModel(system, unknown, start, noise, 2 * jnp.log(jnp.asarray([1e-3])), (0,), DT)
     data, x = _logs(model)
-    hessian = information * problem.m_step.weights(model).prior_precision(unknown)
+    hessian = (information * problem.m_step.weights(model).prior_precision(unknown)).at[-1, -1].set(1e20)
     return _Case(problem._replace(state=problem.state._replace(model=model, best=model, hessian=hessian)), data, x)
 
 

@@ -20,7 +20,7 @@ from nnap_em.effects.sensor import SensorBias
 from nnap_em.em.build import build_system
 from nnap_em.em.mstep import _noise_floor
 from nnap_em.em.prior import ParameterPrior
-from nnap_em.em.quadratic import quadratic
+from nnap_em.em.quadratic import local, quadratic, readings_at
 from nnap_em.export.model import parameters
 from nnap_em.fit.identify import begin
 from nnap_em.fit.store import load, save

@@ -18,7 +18,6 @@ from ..data.servo import TORQUE
 from ..em.build import LAG, NO_MACHINE, Scales, build_system, measure_scales
 from ..em.equations import infinite_rates, motion
 from ..em.readings import onset
-from ..em.scale import not_identifiable
 from ..em.servos import build_servos, steps_of_sample
 from ..em.simulated import filter_path, windows
 from ..model.base import prepare
@@ -28,7 +27,7 @@ from ..numerics.digits import counted
 from ..numerics.parallel import each
 from ..smoother.posterior import AbstractSmoother
 from ..systems import AbstractSystem
-from .identifiability import identifiability, sentences
+from .identifiability import identifiability, not_identifiable, sentences
 from .identify import Identified, begin
 from .inverse_dynamics import UNEXPLAINED, Lag, explanations, gains, lag, mistakes, regression
 from .rates import bridged, timing
@@ -279,8 +278,7 @@ def rates(rig: Rig, data: Dataset) -> Iterator[CheckResult]:
 
 def torques(rig: Rig, system: AbstractSystem, data: Dataset, scales: Scales) -> Iterator[CheckResult]:
     """The inputs against gravity and inertia of the declared bodies."""
-    mass, gravity = _loads_along(rig, system, data)
-    needed = gravity + mass * scales.acceleration
+    needed = _needed(rig, system, data, scales.acceleration)
     inputs = np.moveaxis(np.asarray(data.u), -1, 0)[: len(rig.input_columns)]
     for name, joint, gear, u in zip(rig.input_columns, rig.input_joints, system.gears, inputs, strict=True):
         if rig.kinds[name] != TORQUE:
@@ -364,10 +362,10 @@ def _stiff(rig: Rig, system: AbstractSystem, data: Dataset) -> Iterator[CheckRes
         yield CheckResult(ERROR, "servo", f"{text}: look at the units of its gains, or sample faster")
 
 
-def _loads_along(
-    rig: Rig, system: AbstractSystem, data: Dataset
-) -> tuple[Float[np.ndarray, " dof"], Float[np.ndarray, " dof"]]:
-    """Mean inertia and largest gravity of every joint in the poses of the logs [kg m^2 and N m, or kg and N].
+def _needed(
+    rig: Rig, system: AbstractSystem, data: Dataset, acceleration: Float[np.ndarray, " dof"]
+) -> Float[np.ndarray, " dof"]:
+    """Largest gravity of every joint in the poses of the logs, and the force of its mean inertia there [N m, or N].
 
     A joint that bears nothing at zero may bear much elsewhere.  Joints that nobody reads are anywhere in a turn.
     """
@@ -378,7 +376,7 @@ def _loads_along(
     q = np.where(system.angles, np.random.default_rng(0).uniform(-np.pi, np.pi, (POSES, len(system.angles))), 0.0)
     q[:, [joint for joint, _ in read]] = seen
     mass, gravity = map(np.asarray, _loads(system, jnp.asarray(q)))
-    return np.mean(mass, axis=0), np.percentile(np.abs(gravity), 99, axis=0)
+    return np.percentile(np.abs(gravity), 99, axis=0) + np.mean(mass, axis=0) * acceleration
 
 
 @eqx.filter_jit

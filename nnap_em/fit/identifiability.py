@@ -1,5 +1,6 @@
 """Identifiability: uncertain numbers that no motion depends on, or only in combination with others."""
 
+import dataclasses
 from typing import NamedTuple
 
 import jax
@@ -7,7 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from ..data.rig import Rig
+from ..data.dataset import Dataset
+from ..data.rig import Declared, Rig
 from ..model import hooks
 from ..model.servo import Servo, unlimited
 from ..systems import AbstractSystem
@@ -41,7 +43,7 @@ def identifiability(rig: Rig, system: AbstractSystem, servos: tuple[Servo, ...] 
     names = [name for name in names if name in rig.bodies or name.rpartition(".")[2] not in _MOMENTS]
     if not names:
         return Identifiability()
-    columns, friction = _columns(system, servos, names)
+    columns, friction, _ = _columns(system, servos, names)
     columns = columns * np.asarray([rig.parameters[name].std for name in names])[None, :]
     size = np.linalg.norm(columns, axis=0)
     felt = size > SHARE_LEFT * size.max()
@@ -66,8 +68,10 @@ def identifiability(rig: Rig, system: AbstractSystem, servos: tuple[Servo, ...] 
 
 def _columns(
     system: AbstractSystem, servos: tuple[Servo, ...], names: list[str]
-) -> tuple[Float[np.ndarray, "row param"], Float[np.ndarray, "row curve"]]:
-    """Derivatives of the inverse dynamics at random states by the parameters, and functions of each joint's rate."""
+) -> tuple[Float[np.ndarray, "row param"], Float[np.ndarray, "row curve"], Float[np.ndarray, " row"]]:
+    """Derivatives of the inverse dynamics at random states by the parameters, functions of each joint's rate, and the
+    inverse dynamics themselves.
+    """
     rng, dof = np.random.default_rng(0), len(system.coordinates)
     q, v, a = (jnp.asarray(rng.uniform(-3.0, 3.0, (8 + 4 * dof, dof)), float) for _ in range(3))
     u = jnp.asarray(rng.uniform(-3.0, 3.0, (8 + 4 * dof, len(system.joints))), float)
@@ -92,10 +96,10 @@ def _columns(
     if servos:
         accelerations = lambda q, v, u: jnp.stack(system.acceleration(q, v, driven(system, servos, q, v, u)))  # noqa: E731
         a = jax.jit(jax.vmap(accelerations))(q, v, u)
-    slopes = jax.jit(jax.jacfwd(force))(values, a)
+    slopes, whole = jax.jit(jax.jacfwd(lambda *at: 2 * (force(*at),), has_aux=True))(values, a)
     powers = np.asarray(v)[:, :, None] ** np.arange(_POWERS)
     curves = np.einsum("rjp,ij->rijp", powers, np.eye(dof)).reshape(q.size, -1)
-    return np.stack([np.asarray(slope, np.float64) for slope in slopes], axis=1), curves
+    return np.stack([np.asarray(slope, np.float64) for slope in slopes], axis=1), curves, np.asarray(whole)
 
 
 def sentences(result: Identifiability) -> list[str]:
@@ -103,3 +107,32 @@ def sentences(result: Identifiability) -> list[str]:
     never = f"no motion depends on {', '.join(result.never)}: kept as declared; declare them as numbers"
     kept = "only in combination: along the rest they keep what is declared, and their std says so"
     return [never] * bool(result.never) + [f"motions determine {', '.join(g)} {kept}" for g in result.together]
+
+
+def not_identifiable(rig: Rig, system: AbstractSystem, data: Dataset) -> tuple[str, ...]:
+    """The uncertain parameters that carry the scale of the machine, where it is not identifiable; else none.
+
+    Without a torque the motion is the same when M(q) and c(q, v) are multiplied by one number, and the learned friction
+    with them. That number is free as long as a change of the uncertain parameters multiplies M and c. Of the change
+    that is the least in declared standard deviations, the parameter that moves by the most of them is held; and so on.
+    """
+    if rig.equations or rig.input_kinds or np.any(np.asarray(data.u)[np.asarray(data.valid)]):
+        return ()  # the gains of servos are numbers of the machine
+    left, held = [name for name, declared in rig.bodies.items() if declared.std > 0], []
+    columns, _, whole = _columns(system, (), left) if left else (np.zeros((0, 0)), None, np.zeros(0))
+    columns = dict(zip(left, columns.T, strict=True))
+    # Share of the equations of motion that may be missed by the parameters that scale them: rounding, in 32 bits too
+    rounding = 1e-4
+    while left:
+        one = np.stack([rig.parameters[name].std * columns[name] for name in left], axis=1)
+        steps = np.linalg.lstsq(one, whole, rcond=1e-9)[0]
+        if np.linalg.norm(one @ steps - whole) > rounding * np.linalg.norm(whole):
+            break
+        held.append(left.pop(int(np.argmax(np.abs(steps)))))
+    return tuple(held)
+
+
+def holding(rig: Rig, names: tuple[str, ...]) -> Rig:
+    """The rig with some parameters kept as they are declared."""
+    kept = {name: Declared(rig.parameters[name].mean, 0.0) for name in names}
+    return dataclasses.replace(rig, parameters={**rig.parameters, **kept}) if kept else rig

@@ -34,7 +34,6 @@ from ..em.mstep import ScoringMStep, not_diverged
 from ..em.multistep import JUDGED, LEAST_FALL, errors, finish, followed, ratio
 from ..em.prior import ParameterPrior
 from ..em.readings import white_readings
-from ..em.scale import holding, not_identifiable
 from ..em.stated import widened
 from ..em.weights import Weights
 from ..model.state_space import StateSpaceModel, with_effects
@@ -43,6 +42,7 @@ from ..numerics.profile import stage
 from ..smoother.gaussian import CubatureSmoother
 from ..smoother.posterior import AbstractSmoother
 from ..smoother.start import StartBank
+from .identifiability import holding, not_identifiable
 from .misfit import Misfit, ahead, misfit, simulating
 
 MakeSmoother = Callable[[StartBank], AbstractSmoother]

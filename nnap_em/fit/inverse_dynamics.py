@@ -23,10 +23,10 @@ from scipy.optimize import least_squares
 from ..data.dataset import Dataset
 from ..data.noise import reading_noise
 from ..data.rig import HOLD, SMOOTH, Rig
-from ..em.scale import not_identifiable
 from ..em.servos import build_servos
 from ..model import hooks
 from ..systems import AbstractSystem
+from .identifiability import not_identifiable
 
 WIDTH, ORDER = 7, 4
 """Rows and degree of the polynomials that differentiate: a short window hardly bends a fast motion."""

@@ -58,19 +58,15 @@ def posterior_of(fitted: Identified, data: Dataset) -> Posterior:
     return e_step(fitted.model, data, fitted.smoother.tolerant(), key=fitted.state.key)
 
 
-def show(model, state: Gaussian, seq: Dataset) -> Gaussian:
+def show(model, one: tuple[Gaussian, Dataset]) -> Gaussian:
     """Smoothed states of one sequence as `model.shown` has them."""
 
-    def one(mean, cov, u):
+    def row(mean, cov, u):
         rows = jax.jacfwd(model.shown)(mean, u)
         return Gaussian(model.shown(mean, u), rows @ cov @ rows.T)
 
-    return jax.vmap(one)(state.mean, state.cov, model.inputs(seq))
-
-
-def _shown(model, one) -> Gaussian:
     state, seq = one
-    return show(model, state, seq)
+    return jax.vmap(row)(state.mean, state.cov, model.inputs(seq))
 
 
 class Paths(NamedTuple):
@@ -135,7 +131,7 @@ def _roll(common: Paths, one) -> tuple[Float[Array, "time readable"], Float[Arra
 
     _, (m, s) = jax.lax.scan(step, start, (rows, u, kick))
     ahead = (rows > last)[:, None]
-    past = show(model, Gaussian(mean, cov), seq)
+    past = show(model, (Gaussian(mean, cov), seq))
     std = jnp.sqrt(jnp.diagonal(past.cov, axis1=1, axis2=2))
     return jnp.where(ahead, m, past.mean), jnp.where(ahead, s, std)
 
@@ -164,7 +160,7 @@ def smooth(fitted: Identified, data: Dataset | Logs) -> Gaussian:
     drawn = 32  # models for the dependence of a smoothed state on the model
     path, phi = posterior_of(fitted, data).state, phi_samples(fitted, drawn, key=key_model)
     model_cov = of_states(fitted.model, fitted.m_step, path, data, phi, fitted.discrepancy, key=key_force)
-    shown = each(_shown, fitted.model, (path._replace(cov=path.cov + model_cov), data))
+    shown = each(show, fitted.model, (path._replace(cov=path.cov + model_cov), data))
     return jax.device_put(jax.tree.map(lambda a: np.asarray(a)[:, :rows], shown))
 
 

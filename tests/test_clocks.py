@@ -280,5 +280,3 @@ def test_an_input_that_is_silent_alone_is_seen(tmp_path):
     log = _import(path, rig=ARM)
     assert np.isfinite(half[0]).sum() == np.isfinite(half[1]).sum()
     assert _rows(log) == pytest.approx([401, 299], abs=2)
-    (gap,) = log.topics[0].gaps
-    assert (gap.start, gap.end) == pytest.approx((3.99, 7.0), abs=0.02)

@@ -121,6 +121,8 @@ def test_lists_and_episodes_are_sequences(tmp_path):
         names = separator.join(("episode_index", "u", "theta1", "dtheta1"))
         log = dialects.table(tmp_path / "train/a.csv", names, (episode, U, Q, V), separator, decimal)
         _close(_imported(log, _rig(tmp_path)), 100, 2e-8, 2)
+    with pytest.raises(DataError, match=r"line 102, column 'episode_index': another episode begins; `nnap-em im"):
+        read_logs(log.parent, read_rig(tmp_path / "rig.toml", specs))
 
 
 DEG = np.pi / 180

@@ -590,8 +590,8 @@ a gap does not end a sequence
 # import_/objects.py
 ## test_recordings.py::test_messages_of_many_forms_on_one_topic_are_read_by_the_names_in_each
 names of the first message are those of all
-- (places := _places(tuple(found)))
-+ (places := _places(("a", "b")))
+- return _places(tuple(found))
++ return _places(("a", "b"))
 # import_/bags.py
 ## test_recordings.py::test_bags_of_ros_1_and_2_are_read[1-a.bag]
 nanoseconds of a stamp left out

@@ -2,7 +2,6 @@
 
 import dataclasses
 import re
-import sys
 import warnings
 
 import jax
@@ -50,8 +49,6 @@ def test_a_folder_without_logs_is_refused(tmp_path):
 READABLE = {
     "byte order mark": lambda s: "\ufeff" + s,
     "windows lines": lambda s: s.replace("\n", "\r\n"),
-    "blank lines at the end": lambda s: s + "\n\n",
-    "blanks around fields": lambda s: s.replace(",", " , "),
     "UTF-16": lambda s: s.encode("utf-16"),
     "western European": lambda s: s.replace("\n", ",\n").replace(",\n", ",Wert °\n", 1).encode("cp1252"),
     "other order": lambda s: "\n".join(",".join(reversed(row.split(","))) for row in s.splitlines()),
@@ -115,16 +112,6 @@ def test_a_mistake_is_refused(tmp_path, name):
         read_logs(tmp_path, RIG)
     for word in (str(path), *words.split(" | ")):
         assert word in str(refused.value)
-
-
-def test_only_parquet_needs_an_extra(tmp_path, monkeypatch):
-    """scipy, which reads MAT files, comes with JAX."""
-    monkeypatch.setitem(sys.modules, "pyarrow", None)
-    OTHERS[".mat"](tmp_path / "01.mat", _log())
-    assert read_logs(tmp_path, RIG).files == ("01.mat",)
-    (tmp_path / "02.parquet").write_bytes(b"any")
-    with pytest.raises(DataError, match=r"cannot be read without pyarrow; pip install 'nnap-em\[formats\]'"):
-        read_logs(tmp_path, RIG)
 
 
 def test_padding_is_marked_and_neutral():

@@ -82,7 +82,6 @@ READ = {  # what writes a file, its name, and the addresses that names do not gi
     "TwinCAT Scope, names only": (PLAIN, "a.csv", BARE),
     "CODESYS trace": (dialects.codesys, "a.trace.csv", {}),
     "CODESYS trace in us": (functools.partial(dialects.codesys, flags=36), "a.trace.csv", {}),
-    "CODESYS trace with lines of its own": (functools.partial(dialects.codesys, comment=True), "a.trace.csv", {}),
     "CODESYS text": (dialects.codesys_text, "a.txt", {}),
     "LabVIEW": (dialects.labview, "a.lvm", {}),
     "LabVIEW, many times": (functools.partial(dialects.labview, x_columns="Multi"), "a.lvm", {}),
@@ -92,13 +91,10 @@ READ = {  # what writes a file, its name, and the addresses that names do not gi
     "decimal comma": (_table(_names(";"), COLUMNS, ";", ","), "a.csv", {}),
     "decimal comma in quotes": (_table(_names(","), COLUMNS, ",", ",", quote=True), "a.csv", {}),
     "a comment": (_table(_names(","), above=("# of Monday",)), "a.csv", {}),
-    "tabs": (_table(_names("\t"), COLUMNS, "\t"), "a.tsv", {}),
     "units": (UNITS, "a.csv", {}),
     "quoted names": (QUOTED, "a.csv", {"u": '"Motor torque, Nm"'}),
-    "colons": (_table("time,a:u,a:pos,a:vel"), "a.csv", {"theta1": '"a:pos"', "dtheta1": '"a:vel"'}),
     "PlotJuggler": (PATHS, "a.csv", QUANTITIES),
     "NumPy": (_table("# time u theta1 dtheta1", COLUMNS, " "), "a.txt", {}),
-    "no time": (_table("u,theta1,dtheta1", COLUMNS[1:]), "a.csv", {}),
     "no time, decimal comma": (_table("u;theta1;dtheta1", COLUMNS[1:], ";", ","), "a.csv", {}),
 }
 
@@ -125,6 +121,8 @@ def test_lists_and_episodes_are_sequences(tmp_path):
         names = separator.join(("episode_index", "u", "theta1", "dtheta1"))
         log = dialects.table(tmp_path / "train/a.csv", names, (episode, U, Q, V), separator, decimal)
         _close(_imported(log, _rig(tmp_path)), 100, 2e-8, 2)
+    with pytest.raises(DataError, match=r"line 102, column 'episode_index': another episode begins; `nnap-em im"):
+        read_logs(log.parent, read_rig(tmp_path / "rig.toml", specs))
 
 
 DEG = np.pi / 180

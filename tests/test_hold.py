@@ -164,11 +164,3 @@ def test_torque_and_motion_show_the_hold(true, declared, tmp_path):
     assert abs(found.rows - expected) < 0.05 and found.std < 0.03
     assert found.counts == (true != declared)
     assert not found.counts or f'input_hold = "{true}"' in late(rig, found)
-
-
-def test_a_late_drive_is_no_hold(tmp_path):
-    rig = _rig(tmp_path, SMOOTH)
-    data = _recordings(SMOOTH, 0.07)
-    found = lag(regression(rig, build_system(rig), data), 0)
-    assert abs(found.rows - 0.07 / 0.04) < 0.05 and found.counts
-    assert "input_delay" in late(rig, found) and "input_hold =" not in late(rig, found)

@@ -81,16 +81,6 @@ def test_two_clocks_with_jitter_come_to_one_grid(tmp_path):
     assert sure.mean() > 0.99 and table.shape[0] > 780
 
 
-def test_a_command_that_is_held_between_rows_is_averaged_as_asked(tmp_path):
-    t = DT * np.arange(200)
-    command_t = np.sort(np.append(t, t[:-1] + 0.0025))
-    command = np.arange(command_t.size, dtype=float)
-    log = _write(tmp_path / "a.mcap", t, command_t, command)
-    (table,) = _tables(_imported(log, _rig(tmp_path, 'input = "mean"')))
-    u = table[:-1, 1]
-    np.testing.assert_allclose(u, 0.25 * command[:-1:2] + 0.75 * command[1::2], rtol=1e-6)  # stamps are in ns
-
-
 def test_the_mean_of_a_held_signal_is_that_of_its_values_on_a_fine_grid():
     rng = np.random.default_rng(1)
     s = Signal("a", np.sort(rng.uniform(0, 1, 40)), rng.normal(size=40))
@@ -191,8 +181,6 @@ REFUSED = {  # what is wrong with the rig's table, with the log or the words of 
     "unknown topic": (_said("/cmd:", "/cmmd:"), {}, ["column 'u'", "no topic '/cmmd'", "did you mean '/cmd'"]),
     "unknown field": (_said("data[0]", "dat"), {}, ["column 'u'", "no field 'dat'", "data[0]"]),
     "not declared": ({"columns": ""}, {}, ["column 'u': nothing is called so", "[import.columns] u =", "/cmd:data[0]"]),
-    "unknown key": ({"more": "gaps = 1"}, {}, ["[import] gaps", "unknown", "did you mean 'gap'"]),
-    "no scale": (_said('"/cmd:data[0]"', '{ from = "/cmd:data[0]", scale = 0 }'), {}, ["scale is 0"]),
     "gap": ({"more": "gap = -1"}, {}, ["[import] gap", "seconds above 0"]),
     "no overlap": ({}, {"command_t": T + 100}, ["columns 'theta1' and 'u'", "no time in common", "--shift /cmd="]),
     "all NaN": (
@@ -233,19 +221,6 @@ def test_a_name_that_stands_twice_and_a_folder_that_is_not_empty_are_refused(tmp
         assert _import(path, "--rig", _rig(tmp_path, columns=columns), "--out", tmp_path / to, "--test", 1) == 2
         assert said in capsys.readouterr().err
     assert [p.name for p in out.iterdir()] == ["mine.txt"] and not (tmp_path / "new").exists()
-
-
-def test_the_numbers_of_an_import_are_those_of_the_log(tmp_path):
-    rng = np.random.default_rng(2)
-    t = _jittered(rng, 10.0, 0.01, 0.4)
-    t = t[(t < 3) | (t > 4)]
-    log = _write(tmp_path / "a.mcap", t, DT * np.arange(1000), np.cos(DT * np.arange(1000)))
-    text = (_imported(log, _rig(tmp_path), 1) / "import.json").read_text()
-    for part in ("/js", "/cmd", "train/000.csv", "test/000.csv", "header stamp", "log time"):
-        assert part in text
-    topic = json.loads(text)["logs"][0]["topics"][0]
-    assert topic["rate"] == pytest.approx(100, rel=0.02) and len(topic["gaps"]) == 1
-    assert topic["jitter"] == pytest.approx(np.std(np.diff(t)[np.diff(t) < 0.5]), rel=1e-3)
 
 
 def test_a_machine_from_a_file_is_imported_and_found_from_the_new_folder(tmp_path):

@@ -230,9 +230,7 @@ BAD = {  # the file, what writes it, and words of the message
         "'/js' | does not fit its schema (Expecting | write it as"),
     "HDF5 without times": ("a.h5", lambda p: write_hdf5(p, {"js": {"time": np.where(T[5] == T, np.nan, T), "q": T}}),
         "'/js/time' | no numbers | cut the rows"),
-    "no HDF5 file": ("a.h5", lambda p: p.write_text("hello"), "no HDF5 file | another copy"),
     "no time axis": ("a.h5", lambda p: write_hdf5(p, {"js": {"q": T}}), "'/js' | no time axis (holds q) | `time`"),
-    "no such file": ("b.mcap", lambda p: None, "no such file"),
     "another kind": ("a.dat", lambda p: p.write_text("x"), "logs end in .mcap, .db3, .bag, .h5 | rename"),
 }  # fmt: skip
 

@@ -5,8 +5,8 @@ examples:
   nnap-em import run.mcap --rig rig.toml --out bench
   nnap-em import day1.mcap day2.mcap --rig rig.toml --out bench --test 0.2 --shift /joint_states=-0.012
 
-Brings topics with clocks of their own to rows that are [sampling] dt apart, cuts sequences at gaps, and reports rates,
-jitter, gaps and rows used in FOLDER/import.json.  Where columns come from stands in the table [import.columns] of
+Brings topics with clocks of their own to rows that are [sampling] dt apart, cuts sequences at gaps, and reports rates
+and rows used in FOLDER/import.json.  Where columns come from stands in the table [import.columns] of
 rig.toml; what is not there is found by its name.  MCAP (ROS 2, JSON, protobuf), ROS bags, workbooks and HDF5 need
 pip install "nnap-em[logs]".
 """

@@ -359,16 +359,12 @@ def _separator_hint(first: str, last: str) -> str | None:
 def _check_names(path: Path, names: Sequence[str], required: Sequence[str], gaps: Sequence[str]) -> None:
     """Refuse columns that are not there, or more than once."""
     line = "line 1, " if path.suffix.lower() == ".csv" else ""
-    every = (*required, *gaps)
-    spare = [name for name in names if name not in every]
-    for name in every:
+    spare = [name for name in names if name not in (*required, *gaps)]
+    for name in (*required, *gaps):
         if name not in names:
-            hint = header_hint(path)
-            alone = "no other column is free for it: log it, or correct the columns of rig.toml"
-            other = "or correct [input] columns in rig.toml" if name in required else ""
-            other = "or `nnap-em import` it: it reads other names, separators and clocks" if name == "time" else other
-            mend = hint or (nearest(name, spare) if spare else alone)
-            refuse(path, f"{line}column {name!r}", "missing", f"{mend}; {other}" if other and (spare or hint) else mend)
+            reads = "or `nnap-em import` it: it reads other names, separators and clocks"
+            other = reads if name == "time" else "or correct the columns of rig.toml"
+            refuse(path, f"{line}column {name!r}", "missing", f"{header_hint(path) or nearest(name, spare)}; {other}")
         if names.count(name) > 1:
             refuse(path, f"{line}column {name!r}", f"stands there {names.count(name)} times", "keep one of them")
 

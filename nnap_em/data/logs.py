@@ -18,7 +18,7 @@ from .held import repeats as held_rows
 from .plausible import implausible, repeats
 from .rig import Rig
 from .rough import Rough, rough
-from .units import other_unit
+from .units import is_episode, other_unit
 
 TOLERANCE = 0.01  # of the declared dt, for every interval
 LOST = 2  # rows that follow each other over which inputs are interpolated
@@ -245,6 +245,10 @@ def _read_table(path: Path, rig: Rig) -> _Table:
     content = table_of(path)
     clock = ("time",) if "time" in content.names or header_hint(path) or untimed(content.names) else ()
     table = columns_of(content, (*clock, *rig.logged_inputs), rig.measured)
+    for name in filter(is_episode, content.names):
+        if changes := np.flatnonzero(np.diff(columns_of(content, (name,))[:, 0])).tolist():
+            hint = "`nnap-em import` it: each becomes a sequence"
+            refuse(path, place(path, name, changes[0] + 1), "another episode begins", hint)
     if not clock:
         problem = f"no column of times: rows are taken as dt = {rig.dt:g} s apart"
         warnings.warn(f"{path}: {problem}; log the time [s], so that lost rows show", DataWarning, 2)

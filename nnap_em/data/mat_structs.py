@@ -20,9 +20,7 @@ def mat_columns(path: Path, variables: Mapping[str, np.ndarray]) -> Iterator[tup
     for name, value in variables.items():
         if "s2" in (value.dtype.names or ()):  # as scipy gives what it does not read
             called, _, kind = (text.decode() for text in list(value[0])[:3])
-            hint = (
-                f"in MATLAB: s.time = {called}.Time; s.{called} = {called}.Data; save('log.mat', '-struct', 's', '-v7')"
-            )
+            hint = _OBJECTS.get(kind, _OBJECTS["timeseries"]).format(called)
             raise DataError(f"{path}: variable {called!r}: an object ({kind}), which only MATLAB reads; {hint}")
         form = _struct(value)
         yield from [(name, value)] if form is None else form(name, value)
@@ -49,6 +47,14 @@ def _structure_with_time(name: str, record: Any) -> Iterator[tuple[str, Any]]:
 
 _STRUCTS = {("X", "Y"): _control_desk, ("time", "signals"): _structure_with_time}
 """Structs of recorders, by fields that they have; for another one, add a function that gives its columns."""
+_OBJECTS = {
+    "timeseries": "in MATLAB: s.time = {0}.Time; s.{0} = {0}.Data; save('log.mat', '-struct', 's', '-v7')",
+    "timetable": "in MATLAB: s = table2struct(timetable2table({0}), 'ToScalar', true); s.time = seconds({0}.Time); "
+    "save('log.mat', '-struct', 's', '-v7')",
+    "Simulink.SimulationData.Dataset": "in MATLAB: s.time = {0}{{1}}.Values.Time; for k = 1:{0}.numElements, "
+    "s.({0}{{k}}.Name) = {0}{{k}}.Values.Data; end, save('log.mat', '-struct', 's', '-v7')",
+}
+"""Lines that write a MATLAB object as a struct, by its class."""
 
 
 def _struct(value: np.ndarray) -> Callable[[str, Any], Iterator[tuple[str, Any]]] | None:

@@ -22,7 +22,8 @@ def flatten(message: Any) -> dict[str, float]:
 
 def pick(message: Any, path: str) -> float:
     """The number at a path; NaN where the message has none."""
-    (at, names), parent = _way(message, path), None
+    at, names = _way(message, path) if isinstance(message, dict) else (message, steps(path))
+    parent = None
     try:
         for step in names:
             if isinstance(step, int):
@@ -37,7 +38,7 @@ def pick(message: Any, path: str) -> float:
 
 
 def _way(message: Any, path: str) -> tuple[Any, tuple[str | int, ...]]:
-    """Start and steps of a path; a name with dots or brackets, as `Torque [Nm]`, is one step."""
+    """Start and steps of a path in a dict; a name with dots or brackets, as `Torque [Nm]`, is one step."""
     while isinstance(message, dict) and path not in message and isinstance(message.get(path.split(".")[0]), dict):
         head, _, path = path.partition(".")
         message = message[head]
@@ -62,21 +63,23 @@ def _numbers(at: Any, path: str) -> Iterator[tuple[str, float]]:
 
 
 def _is_list(value: Any) -> bool:
-    return isinstance(value, Sequence | np.ndarray) and not isinstance(value, str | bytes)
+    quick = list, tuple, np.ndarray
+    return isinstance(value, quick) or (isinstance(value, Sequence) and not isinstance(value, str | bytes))
 
 
 def _names(parent: Any) -> dict[str, int]:
     """Places of the entries by their names, different texts all."""
     for field in NAMES:
         found = _get(parent, field, None)
-        if _is_list(found) and all(isinstance(name, str) for name in found) and (places := _places(tuple(found))):
-            return places
+        if found is not None and _is_list(found) and len(found) and isinstance(found[0], str):
+            return _places(tuple(found))
     return {}
 
 
 @functools.lru_cache
-def _places(names: tuple[str, ...]) -> dict[str, int]:
-    return {name: i for i, name in enumerate(names)} if all(names) and len(set(names)) == len(names) else {}
+def _places(names: tuple[Any, ...]) -> dict[str, int]:
+    different = len(set(names)) == len(names) and all(isinstance(name, str) and name for name in names)
+    return {name: i for i, name in enumerate(names)} if different else {}
 
 
 def _fields(at: Any) -> Sequence[str]:

@@ -21,14 +21,12 @@ from .recording import UNTIMED, Address, Recording, Track
 from .signals import (
     FEWEST_ROWS,
     SLOW,
-    Gap,
     Signal,
     Spans,
     Stretch,
     averaged,
     covered,
     cut,
-    gaps,
     held,
     hold,
     interpolated,
@@ -50,14 +48,8 @@ class TopicFacts(NamedTuple):
     """Columns of the data set; none: the topic is not used."""
     messages: int | None
     clock: str = ""
-    start: float = math.nan
-    """First message, on the clock of the log's first one [s]."""
-    end: float = math.nan
     rate: float = math.nan
     """Messages per second, by the median interval."""
-    jitter: float = math.nan
-    """Standard deviation of the intervals that are no gap [s]."""
-    gaps: tuple[Gap, ...] = ()
     notes: tuple[str, ...] = ()
 
 
@@ -108,9 +100,11 @@ def resample(path: Path, rig: Rig, plan: Plan, shifts: Mapping[str, float], unwr
         signals[name] = replace(s, longest=math.inf if on_change else longest_silence(s, rig.dt, plan.gap))
     rows, sequences = _gridded(path, rig, plan, signals)
     facts = {each.name: TopicFacts(each.name, each.kind, (), each.messages) for each in topics}
-    for name, track in recording.tracks.items():
-        columns = {column: s for column, s in signals.items() if s.topic == name}
-        facts[name] = _facts(facts[name], track, clocks[name], columns)
+    for topic, track in recording.tracks.items():
+        columns = tuple(name for name, at in addresses.items() if at.topic == topic)
+        rate = 1 / float(np.median(np.diff(clocks[topic]))) if track.t.size > 1 else math.nan
+        known = {"columns": columns, "messages": track.t.size, "clock": track.clock, "rate": rate, "notes": track.notes}
+        facts[topic] = facts[topic]._replace(**known)
     return Resampled(
         path,
         origin,
@@ -155,8 +149,12 @@ def _gridded(path: Path, rig: Rig, plan: Plan, signals: Mapping[str, Signal]) ->
         if name in rig.logged_inputs
     }
     common = _common(path, signals, watched | commanded)
-    _fine(path, readings, dt)
-    fastest = min(readings.values(), key=lambda s: s.interval)
+    name, fastest = min(readings.items(), key=lambda item: item[1].interval)
+    finest = 4.0  # rows from one reading to the next of the fastest topic from which on the grid is refused as too fine
+    if fastest.interval > finest * dt:
+        problem = f"dt = {dt:g} s is much finer than the readings, {fastest.interval:.4g} s apart ({name})"
+        other = f"write dt = {float(f'{fastest.interval:.2g}'):g} in rig.toml"
+        refuse(path, "[sampling] dt", problem, other_unit(fastest.interval / dt, other))
     spans = covered([*watched.values()], 1)
     pieces = runs(covered([spans, common, *commanded.values()], 2 + len(commanded)), fastest, dt)
     shortest = FEWEST_ROWS if plan.shortest is None else max(math.ceil(plan.shortest / dt), 2)
@@ -182,17 +180,6 @@ def _common(path: Path, signals: Mapping[str, Signal], spans: Mapping[str, Spans
     return np.array([[ends[late][0], ends[early][1]]])
 
 
-def _fine(path: Path, readings: Mapping[str, Signal], dt: float) -> None:
-    """Refuse a grid on which next to no row would have a reading."""
-    name, best = min(readings.items(), key=lambda item: item[1].interval)
-    finest = 4.0  # rows from one reading to the next of the fastest topic from which on the grid is refused as too fine
-    if best.interval > finest * dt:
-        place = f"in {best.topic!r} ({name})" if best.topic else f"({name})"
-        problem = f"dt = {dt:g} s is much finer than the readings, {best.interval:.4g} s apart {place}"
-        other = f"write dt = {float(f'{best.interval:.2g}'):g} in rig.toml"
-        refuse(path, "[sampling] dt", problem, other_unit(best.interval / dt, other))
-
-
 def _sequence(stretch: Stretch, rig: Rig, mean: bool, signals: Mapping[str, Signal]) -> _Rows:
     """Columns of a segment; dropped is one in which a column of readings is empty, which no other command accepts."""
     if stretch.why:
@@ -205,20 +192,6 @@ def _sequence(stretch: Stretch, rig: Rig, mean: bool, signals: Mapping[str, Sign
     missing = {name: int(np.isnan(columns[name]).sum()) for name in rig.measured}
     why = next((f"{name} has no reading there" for name, count in missing.items() if stretch.rows - count < 2), "")
     return stretch._replace(missing=missing, why=why), columns
-
-
-def _facts(
-    facts: TopicFacts, track: Track, t: Float[np.ndarray, " message"], signals: Mapping[str, Signal]
-) -> TopicFacts:
-    """Rate, jitter and gaps of a topic that was read, of which these are the columns."""
-    steps = np.diff(t)
-    usual = steps[steps <= min(s.longest for s in signals.values())]
-    rate, jitter = (1 / float(np.median(steps)), float(np.std(usual))) if usual.size else (math.nan, math.nan)
-    gone = tuple(sorted({gap for s in signals.values() for gap in gaps(s)}))
-    return facts._replace(
-        columns=tuple(signals), messages=t.size, clock=track.clock, start=float(t[0]), end=float(t[-1]), rate=rate,
-        jitter=jitter, gaps=gone, notes=track.notes,
-    )  # fmt: skip
 
 
 def _late(tracks: Mapping[str, Track], dt: float, shifts: Collection[str]) -> Iterator[str]:

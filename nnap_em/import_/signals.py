@@ -86,13 +86,6 @@ def _before(signal: Signal, at: Float[np.ndarray, " x"]) -> np.ndarray:
     return np.clip(np.searchsorted(signal.t, at, side="right") - 1, 0, signal.t.size - 1)
 
 
-class Gap(NamedTuple):
-    """A silence of a topic, between two messages [s]."""
-
-    start: float
-    end: float
-
-
 class Stretch(NamedTuple):
     """Rows that become one file, or are dropped."""
 
@@ -123,12 +116,6 @@ def sent_on_change(signal: Signal, dt: float) -> bool:
     Set points have a median interval of more than a row: no drive waits so long.
     """
     return signal.t.size <= 10 or signal.interval >= max(0.5, 1.5 * dt)
-
-
-def gaps(signal: Signal) -> list[Gap]:
-    """The silences that are longer [s]."""
-    spans = present(signal)
-    return [Gap(start, end) for start, end in zip(spans[:-1, 1].tolist(), spans[1:, 0].tolist(), strict=True)]
 
 
 def present(signal: Signal, hold: float = 0.0) -> Spans:

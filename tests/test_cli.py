@@ -314,7 +314,6 @@ BAD = {
     "smooth bench bench/test --out out": "model.npz: cannot be read",
     "smooth bench/test/000.csv bench/test --out out": r"000\.csv: no model",
     "predict fit nothing --given 1 --out out": "nothing: is no folder",
-    "design fit --out out --for speed": "--for speed: not a question of this fit; possible here: friction, .*all",
     "simulate out --system slide --measured y": "--measured y: no state of this system; possible here: x, dx",
     "simulate out --system slide --measured x x": "--measured x x: a state stands there twice",
 }

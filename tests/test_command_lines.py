@@ -49,7 +49,7 @@ RUNS: dict[str, tuple[str, ...]] = {
     "identify bench --out DIR --from january": (),
     "diagnose bench --out DIR": ("after.npz", "friction_before.csv"),
     f"diagnose bench --out DIR --from january --logs bench --more february --minutes 1 {EVERY}": (),
-    f"design fit --out DIR --for friction --seconds 1.2 --sequences 2 --logs bench {EVERY}": (),
+    f"design fit --out DIR --seconds 1.2 --sequences 2 --logs bench {EVERY}": (),
     "design fit --out DIR": ("design.json", "inputs/1.csv", "motion/6.csv"),
     "compare fit other --out DIR": ("compare.html",),
     "predict fit bench/test --given 0.1 --out DIR --seed 1 --trust-readings": ("000.csv",),
@@ -224,7 +224,7 @@ def test_a_design_is_as_long_in_python_as_by_the_command():
         inspect.signature(experiment.design).parameters,
         PARSER.parse_args(["design", "fit", "--out", "x"]),
     )
-    for option, name in (("seconds", "seconds"), ("sequences", "sequences"), ("for", "question")):
+    for option, name in (("seconds", "seconds"), ("sequences", "sequences")):
         assert getattr(args, option) == parameters[name].default
 
 

@@ -113,7 +113,6 @@ def parser() -> argparse.ArgumentParser:
     design = command("design")
     _file(design, "folder", "FIT", "model.npz or after.npz, or the folder that holds it")
     _file(design, "--out", "OUT", "folder for the results", required=True)
-    design.add_argument("--for", metavar="QUESTION", default="all", help="what is to be learned (default: all)")
     design.add_argument("--seconds", type=_time, default=60.0, metavar="S", help="of all sequences together (60)")
     design.add_argument("--sequences", type=_count, default=6, metavar="N", help="how many (6)")
     _file(design, "--logs", "FOLDER", "of the fit, where they were moved", **several)

@@ -143,7 +143,7 @@ ORDER = {
         "0.200 → 0.300 (1.5 × larger) | 0.807 → 0.00580 (139 ×) | Of 4 tests | 1 before and none after fail | "
         "Friction was bent. | hard stop at joint 1 | spike | Unhook the cable. | Details | "
         "cogging at joint 1 | 1.00 ± 0.10 kg | act together | "
-        "0.00500 rad (estimated) | 172 s",
+        "0.00500 rad (estimated) | seconds | 172",
     ),
     "fit": (
         FIT,

@@ -47,11 +47,6 @@ WHOLE = {
     "parameters": {"before": {"m1": MASS}, "after": {"m1": MASS | {"value": 1.1}}},
     "noise": {"before": NOISE, "after": NOISE},
     "undetermined": ["m1 and I1 act together."],
-    "rounds": [
-        {"horizon_s": 1.0, "refitted": [], "accepted": "torsional spring at joint 2",
-         "screened": [{"name": "cogging", "joint": 1, "channel": None, "inputs": [], "gain": 12.3}]},
-        {"horizon_s": 5.0, "screened": None, "refitted": None, "accepted": None},
-    ],
     "next": ["Unhook the cable."],
     "masked": [{"part": "test", "file": "b.csv", "column": "theta1", "kind": "spike", "amount": 3, "time": 0.5}],
     "seconds": 172.0,
@@ -68,7 +63,7 @@ FIT = {
     "left_out": ["03.csv"],
     "model": "model.npz",
 }
-NOTHING = WHOLE | {"effects": [], "rounds": [], "friction_change": ""}
+NOTHING = WHOLE | {"effects": [], "friction_change": ""}
 REPORTS = (
     WHOLE,
     NOTHING,
@@ -113,11 +108,6 @@ def test_a_page_says_where_no_test_sequence_reaches_a_prediction():
     assert said in _text(WHOLE | {"error": short}) and said not in _text(WHOLE)
 
 
-def test_a_round_that_scored_nothing_is_on_the_page():
-    nothing = {"horizon_s": 5.0, "screened": [], "refitted": [], "accepted": None}
-    assert "Over 5.00 s: added nothing No candidate was scored." in _text(WHOLE | {"rounds": [nothing]})
-
-
 def test_predictions_stand_in_the_order_of_their_models():
     """A figure has the first in vermilion, the last in blue."""
     rig, data = slide_rig(), slide_logs(0)
@@ -142,7 +132,7 @@ ORDER = {
         "raises the log-likelihood of the training data by 1142 nat. | Before and after | the first 1.0 s | "
         "0.200 → 0.300 (1.5 × larger) | 0.807 → 0.00580 (139 ×) | Of 4 tests | 1 before and none after fail | "
         "Friction was bent. | hard stop at joint 1 | spike | Unhook the cable. | Details | "
-        "cogging at joint 1 | 1.00 ± 0.10 kg | act together | "
+        "1.00 ± 0.10 kg | act together | "
         "0.00500 rad (estimated) | seconds | 172",
     ),
     "fit": (

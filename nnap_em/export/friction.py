@@ -15,7 +15,7 @@ REPORTED_MISS = 0.1
 
 
 class FrictionForm(NamedTuple):
-    """Friction that opposes motion, and a constant torque.
+    """Friction that opposes motion, and a constant torque [N m, rad/s, or N, m/s].
 
         tau(v) = offset - (coulomb + (breakaway - coulomb) exp(-(v / stribeck)^2)) tanh(v / smooth) - viscous v
 
@@ -23,17 +23,13 @@ class FrictionForm(NamedTuple):
     """
 
     coulomb: float = 0.0
-    """[N m or N]"""
     breakaway: float = 0.0
-    """[N m or N]; the Coulomb torque where there is no dip."""
+    """The Coulomb torque where there is no dip."""
     stribeck: float = 1.0
-    """[rad/s or m/s]"""
     viscous: float = 0.0
-    """[N m s/rad or N s/m]"""
     offset: float = 0.0
-    """[N m or N]"""
     smooth: float = 0.0
-    """Velocity over which the sign changes [rad/s or m/s]."""
+    """Velocity over which the sign changes."""
     missed: float = 0.0
     """Root mean square of the rest of the curve, over that of the curve [1]."""
 

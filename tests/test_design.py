@@ -209,17 +209,6 @@ def test_logs_that_are_not_those_of_the_fit_are_refused(slide_fit, tmp_path, cap
 # --- [limits] of rig.toml
 
 BOUNDS = "\n[limits]\nu = 0.5\nx = [-1, 2.5]\n[limits.rate]\nu = 4\n[limits.start]\nx = 0.25\n"
-
-
-def test_limits_are_read_and_written(tmp_path):
-    path = tmp_path / "rig.toml"
-    write_rig(slide_rig(), path)
-    path.write_text(path.read_text() + BOUNDS)
-    rig = read_rig(path, specs)
-    assert rig.limits == Bounds({"u": (-0.5, 0.5), "x": (-1.0, 2.5)}, {"u": (-4.0, 4.0)}, {"x": (0.25, 0.25)})
-    assert written_again(rig, tmp_path) == rig
-
-
 WRONG = (
     ("[limits]\nU = 1", r"\[limits\] U: unknown table or key; did you mean 'u'"),
     ("[limits]\nu = 0", r"\[limits\] u: found 0; write .*above 0"),
@@ -228,10 +217,14 @@ WRONG = (
 )
 
 
-def test_wrong_limits_are_refused(tmp_path):
+def test_limits_are_read_and_written_and_wrong_ones_refused(tmp_path):
     path = tmp_path / "rig.toml"
     write_rig(slide_rig(), path)
     text = path.read_text()
+    path.write_text(text + BOUNDS)
+    rig = read_rig(path, specs)
+    assert rig.limits == Bounds({"u": (-0.5, 0.5), "x": (-1.0, 2.5)}, {"u": (-4.0, 4.0)}, {"x": (0.25, 0.25)})
+    assert written_again(rig, tmp_path) == rig
     for lines, reason in WRONG:
         path.write_text(f"{text}\n{lines}\n")
         with pytest.raises(RigError, match=reason):

@@ -12,7 +12,7 @@ from nnap_em.diagnosis.statistics import FAILS
 from nnap_em.effects import catalogue
 from nnap_em.numerics.digits import counted, number, with_std
 from nnap_em.report.document import predictions
-from nnap_em.report.html import Picture, write_report
+from nnap_em.report.html import Picture
 from nnap_em.report.page import page
 from nnap_em.report.wording import p_value, reached
 
@@ -216,12 +216,3 @@ def test_every_effect_is_explained(monkeypatch):
     monkeypatch.setitem(catalogue, "wind", own)
     html = page(WHOLE | {"effects": [EFFECT | {"name": "wind", "description": "a wind"}]})
     assert "push (k)" in html and "<p>A wind.</p>" in html and "<p></p>" not in html
-
-
-def test_names_on_a_written_page_are_those_of_the_user(tmp_path):
-    write_report(
-        tmp_path, "report", {"rig": "Learned"}, page({}, FIGURES), lambda text: text.replace("Learned", "Found")
-    )
-    for file in ("report.html", "report.json"):
-        text = (tmp_path / file).read_text()
-        assert "Found" in text and "Learned" not in text

@@ -112,7 +112,7 @@ def friction(seed: int, out: Path, rate: float | None) -> dict[str, Any]:
     first, key = some(data, slice(SEQUENCES)), jax.random.key(seed)
     base = allowed(identify(rig, first, key=key), first, rate)
     began = time.perf_counter()
-    designed = design(base, first, key=key, question="friction", seconds=5.0 * SEQUENCES, sequences=SEQUENCES)
+    designed = design(base, first, key=key, seconds=5.0 * SEQUENCES, sequences=SEQUENCES)
     seconds = time.perf_counter() - began
     _, new = play(case, designed, seed)
     fits = {"first": base, "more": identify(rig, data, key=key), "designed": identify(rig, joined(first, new), key=key)}

@@ -537,7 +537,7 @@ declared limits that are not heeded
 - declared.get(name, (lo, hi))
 + (lo, hi)
 # data/limits.py
-## test_design.py::test_limits_are_read_and_written
+## test_design.py::test_limits_are_read_and_written_and_wrong_ones_refused
 a bound of one number that holds one way
 - low = -high
 + low = 0.0

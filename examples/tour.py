@@ -121,9 +121,7 @@ error_figure(error, names)
 # Which inputs should the machine play next, so that its friction near rest is known better?
 
 # %%
-design = nnap_em.design(
-    diagnosis.after, train.data, key=jax.random.key(2), question="friction", seconds=4.0, sequences=2
-)
+design = nnap_em.design(diagnosis.after, train.data, key=jax.random.key(2), seconds=4.0, sequences=2)
 figure = Figure(figsize=(5, 3), layout="constrained")
 axes = figure.subplots()
 for u in design.u[..., 0]:

@@ -1,6 +1,5 @@
 """A rod on a hinge with a motor, its motion in NumPy: code that shares nothing with the library."""
 
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -18,22 +17,20 @@ NOISE = (1e-3, 1e-2)
 FILE = f"""<mujoco><compiler angle="radian"/><worldbody><body name="rod"><joint name="hinge" axis="0 -1 0"/>
 <inertial pos="0 0 -{LENGTH}" mass="{MASS}" diaginertia="{INERTIA} {INERTIA} {INERTIA}"/>
 <site name="tip" pos="0 0 -0.4"/></body></worldbody><actuator><motor name="tau" joint="hinge"/></actuator></mujoco>"""
-Level = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
-"""Size of a friction [N m] by torque of the motor, torque of the weight, and rate."""
 
 
-def logs(seed: int, *, mass: float = 0.0, at: tuple[float, float] = (0.0, 0.0), level: Level | None = None) -> Dataset:
-    """Sums of sines as torques, 20 Runge-Kutta steps a sample; a point mass at (x, z) hangs on the rod."""
-    rng, h, (x, z) = np.random.default_rng(seed), DT / 20, at
+def logs(seed: int) -> Dataset:
+    """Sums of sines as torques, 20 Runge-Kutta steps a sample."""
+    rng, h = np.random.default_rng(seed), DT / 20
     t = DT * np.arange(ROWS)
     tones = rng.uniform(1.0, 9.0, (SEQUENCES, 3, 1)), rng.uniform(0, 2 * np.pi, (SEQUENCES, 3, 1))
     u = rng.uniform(0.5, 2.5, (SEQUENCES, 1)) * np.sum(np.sin(tones[0] * t + tones[1]), axis=1)
-    inertia = INERTIA + MASS * LENGTH**2 + mass * (x**2 + z**2)
+    inertia = INERTIA + MASS * LENGTH**2
 
     def rate(state, u):
         q, v = state
-        weight = GRAVITY * (mass * (x * np.cos(q) - z * np.sin(q)) + MASS * LENGTH * np.sin(q))
-        friction = 0.05 * v + (0.1 + (level(u, weight, v) if level else 0.0)) * np.tanh(v / 0.1)
+        weight = GRAVITY * MASS * LENGTH * np.sin(q)
+        friction = 0.05 * v + 0.1 * np.tanh(v / 0.1)
         return np.stack([v, (u - weight - friction) / inertia])
 
     y, state = np.zeros((SEQUENCES, ROWS, 2)), np.stack([rng.uniform(-1, 1, SEQUENCES), np.zeros(SEQUENCES)])
@@ -49,7 +46,7 @@ def logs(seed: int, *, mass: float = 0.0, at: tuple[float, float] = (0.0, 0.0), 
 
 
 def rig(folder: Path, *, pendulum: bool = False) -> Rig:
-    """The rod as its file declares it, without what `logs` adds; as a `pendulum` its programs are compiled sooner."""
+    """The rod as its file declares it; as a `pendulum` its programs are compiled sooner."""
     (folder / "rod.xml").write_text(FILE)
     joint, model, inputs = "hinge", 'type = "mjcf"\nfile = "rod.xml"', ""
     if pendulum:

@@ -237,7 +237,6 @@ BAD = {
     "simulate bench --system slide": "is there already; give a new folder",
     "smooth bench bench/test --out out": "model.npz: cannot be read",
     "predict fit nothing --given 1 --out out": "nothing: is no folder",
-    "design fit --out out --for speed": "--for speed: not a question of this fit; possible here: friction, .*all",
     "simulate out --system slide --measured y": "--measured y: no state of this system; possible here: x, dx",
 }
 

@@ -44,7 +44,7 @@ RUNS: dict[str, tuple[str, ...]] = {
     "identify bench --out DIR --from january": (),
     "diagnose bench --out DIR": ("after.npz",),
     f"diagnose bench --out DIR --from january --logs bench --more february --minutes 1 {EVERY}": (),
-    f"design fit --out DIR --for friction --seconds 1.2 --sequences 2 --logs bench {EVERY}": (),
+    f"design fit --out DIR --seconds 1.2 --sequences 2 --logs bench {EVERY}": (),
     "design fit --out DIR": ("design.json", "inputs/1.csv", "motion/6.csv"),
     "compare fit other --out DIR": ("compare.html",),
     "predict fit bench/test --given 0.1 --out DIR --seed 1 --trust-readings": ("000.csv",),

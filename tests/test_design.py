@@ -106,7 +106,7 @@ def test_what_is_promised_is_what_a_fit_then_states_and_the_truth_is_near(slide)
     """The design is played by the model that made the logs, with noise of its own."""
     rig, data, fitted = slide
     truth = nnap_em.paper.examples["slide"]().model
-    plan = {"question": "m", "seconds": 3.8, "sequences": 4, "effort": SMALL}
+    plan = {"seconds": 3.8, "sequences": 4, "effort": SMALL}
     designed = design(fitted, data, key=jax.random.key(1), **plan)
     made = nnap_em.simulate(truth, jnp.asarray(designed.start), jnp.asarray(designed.u), key=jax.random.key(9)).data
     both = Dataset(*(np.concatenate([a, b]) for a, b in zip(data, made, strict=True)))
@@ -138,7 +138,7 @@ def test_no_motion_of_a_design_leaves_what_the_logs_visited(slide, plan):
 def test_what_can_be_played_is_written_with_a_page(slide, plan, tmp_path):
     """A design replaces its own files."""
     for _ in range(2):
-        write_design(tmp_path, plan, question="all", seed=2, began=0.0, log=lambda text: None)
+        write_design(tmp_path, plan, seed=2, began=0.0, log=lambda text: None)
     document = json.loads((tmp_path / "design.json").read_text())
     assert document["inputs"] == [f"inputs/{i}.csv" for i in (1, 2, 3)] and document["seconds_each"] == plan.t[-1]
     for i, file in enumerate(document["inputs"]):
@@ -209,17 +209,6 @@ def test_logs_that_are_not_those_of_the_fit_are_refused(slide_fit, tmp_path, cap
 # --- [limits] of rig.toml
 
 BOUNDS = "\n[limits]\nu = 0.5\nx = [-1, 2.5]\n[limits.rate]\nu = 4\n[limits.start]\nx = 0.25\n"
-
-
-def test_limits_are_read_and_written(tmp_path):
-    path = tmp_path / "rig.toml"
-    write_rig(slide_rig(), path)
-    path.write_text(path.read_text() + BOUNDS)
-    rig = read_rig(path, specs)
-    assert rig.limits == Bounds({"u": (-0.5, 0.5), "x": (-1.0, 2.5)}, {"u": (-4.0, 4.0)}, {"x": (0.25, 0.25)})
-    assert written_again(rig, tmp_path) == rig
-
-
 WRONG = (
     ("[limits]\nU = 1", r"\[limits\] U: unknown table or key; did you mean 'u'"),
     ("[limits]\nu = 0", r"\[limits\] u: found 0; write .*above 0"),
@@ -228,10 +217,14 @@ WRONG = (
 )
 
 
-def test_wrong_limits_are_refused(tmp_path):
+def test_limits_are_read_and_written_and_wrong_ones_refused(tmp_path):
     path = tmp_path / "rig.toml"
     write_rig(slide_rig(), path)
     text = path.read_text()
+    path.write_text(text + BOUNDS)
+    rig = read_rig(path, specs)
+    assert rig.limits == Bounds({"u": (-0.5, 0.5), "x": (-1.0, 2.5)}, {"u": (-4.0, 4.0)}, {"x": (0.25, 0.25)})
+    assert written_again(rig, tmp_path) == rig
     for lines, reason in WRONG:
         path.write_text(f"{text}\n{lines}\n")
         with pytest.raises(RigError, match=reason):

@@ -1,4 +1,4 @@
-"""Friction of a rod that grows with torques: in closed form, and found."""
+"""Friction of a rod that grows with torques, in closed form."""
 
 from dataclasses import replace
 
@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import rod
 
-from nnap_em import diagnose, findings
 from nnap_em.effects import SearchScales, fields
 from nnap_em.effects.base import a
 from nnap_em.effects.friction import LoadFriction
@@ -105,16 +104,3 @@ def around_rod(model):
         model.system, one, 10 * one, 0 * one, -3 * one, 3 * one, one, ("hinge", "dhinge"), np.ones(2), rod.DT,
         (0.0, 3.0), 3.0, False, True, ("u",),
     )  # fmt: skip
-
-
-@pytest.mark.slow  # fast: test_a_form_is_that_of_the_paper
-def test_torques_of_motor_and_load_apart_are_found_on_one_joint(tmp_path):
-    """The law by the motor's torque alone is found first, then the share of the load's."""
-    data = rod.logs(0, level=lambda u, c, v: np.abs(0.15 * u + 0.05 * c))
-    (finding,) = findings(diagnose(rod.rig(tmp_path, pendulum=True), data, key=jax.random.key(0)))
-    assert finding.effect.name == "load_friction" and finding.effect.joint == 1
-    assert set(finding.parameters) == {"mu", "mu_load"}
-    for name, truth in (("mu", 0.15), ("mu_load", 0.05)):
-        estimate = finding.parameters[name]
-        assert estimate.value == pytest.approx(truth, rel=0.05)
-        assert abs(estimate.value - truth) < 4 * estimate.std

@@ -209,14 +209,6 @@ def test_a_written_file_is_that_of_its_owner(tmp_path):
             np.testing.assert_allclose(ours, theirs, rtol=1e-12, atol=1e-12)
 
 
-def test_a_file_is_written_where_its_meshes_are_gone(tmp_path):
-    fitted = _owned(tmp_path)
-    (tmp_path / "meshes" / "hull.obj").unlink()
-    write_mjcf(fitted, tmp_path / "out.xml")
-    model = mujoco.MjModel.from_xml_path(str(tmp_path / "out.xml"))
-    assert [model.geom(i).name for i in range(model.ngeom)] == ["floor", "tube"]
-
-
 def test_a_fit_that_has_no_machine_file_is_refused(uncertain, tmp_path):
     with pytest.raises(ExportError, match=r"cartpole.xml is no URDF file; write --mjcf"):
         write_urdf(uncertain, tmp_path / "out.urdf")
@@ -231,22 +223,13 @@ def test_found_springs_loads_and_changed_numbers_are_written_and_the_rest_is_tol
     effects = (spring, Payload(jnp.asarray(0.1), joint=2), Cogging.of(0.1, 0.0, 6.0, joint=1))
     fitted = _begun(effects, parameters={"cart.mass": Declared(1.3, 0.1), "rail.armature": Declared(0.2, 0.1)})
     left = write_mjcf(fitted, tmp_path / "out.xml")
-    assert [line for line in left if "friction" not in line] == [
-        "cogging at joint 1: amplitude = 0.1, k = 6, phase = 0 (it has no plain element in MuJoCo)"
-    ]
+    reason = "cogging at joint 1: amplitude = 0.1, k = 6, phase = 0 (it has no plain element in MuJoCo)"
+    assert [line for line in left if "friction" not in line] == [reason]
     model = mujoco.MjModel.from_xml_path(str(tmp_path / "out.xml"))
     assert model.body("pole").mass[0] == pytest.approx(0.3)
     assert model.body("cart").mass[0] == pytest.approx(1.3)
     np.testing.assert_allclose([np.ravel(model.jnt_stiffness[1])[0], model.qpos_spring[1]], [0.8, 0.5])
     assert model.dof_armature[0] == pytest.approx(0.2)
-
-
-def test_a_breakaway_torque_is_named_and_coulomb_friction_written(uncertain, tmp_path, monkeypatch):
-    forms = [FrictionForm(0.3, 0.5, 0.1, 0.2), FrictionForm(0.1, 0.1, 1.0, 0.05)]
-    monkeypatch.setattr("nnap_em.export.mjcf.friction_forms", lambda _: forms)
-    assert write_mjcf(uncertain, tmp_path / "out.xml") == ["breakaway of rail: 0.5 over a Coulomb friction of 0.3"]
-    model = mujoco.MjModel.from_xml_path(str(tmp_path / "out.xml"))
-    np.testing.assert_allclose([model.dof_frictionloss, model.dof_damping], [[0.3, 0.1], [0.2, 0.05]])
 
 
 V = np.linspace(-2.0, 2.0, 160)

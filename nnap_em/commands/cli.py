@@ -98,7 +98,6 @@ def parser() -> argparse.ArgumentParser:
     add("identify", "--particles", "for --smoother particle", "N", _count)
     add("identify", "--epochs", "at most so many in all (40)", "N", _count, default=40)
     add("diagnose", "--minutes", "answer after about M minutes with what is found by then", "M", _minutes)
-    add("design", "--for", "what is to be learned (default: all)", "QUESTION", str, default="all")
     add("design", "--seconds", "of all sequences together (60)", "S", _time, default=60.0)
     add("design", "--sequences", "how many (6)", "N", _count, default=6)
     add("diagnose design", "--logs", "of that fit, where they were moved", "FOLDER", **several)

@@ -2,12 +2,12 @@
 
 examples:
   nnap-em design found --out next                   what the last report leaves open, all together
-  nnap-em design fit --out next --for friction --seconds 60 --sequences 12
+  nnap-em design fit --out next --seconds 60 --sequences 12
   nnap-em diagnose bench --more next/logs --out again
 
 FIT is the output of identify or diagnose.  OUT gets inputs/*.csv (time and inputs, ready to be played), motion/*.csv
 (what should then happen), design.json and design.html (read this one).  Nothing goes beyond [limits] of rig.toml, or
-where nothing is declared beyond what the logs visited.  QUESTION: friction, parameters, the name of one, or all.
+where nothing is declared beyond what the logs visited.
 """
 
 import argparse
@@ -16,7 +16,7 @@ import time
 
 import jax
 
-from ..experiment.experiment import design, open_of
+from ..experiment.experiment import design
 from ..fit.identify import Identified
 from ..fit.store import Stored, model_file, read
 from ..report.design import check_places, write_design
@@ -30,15 +30,13 @@ def run(args: argparse.Namespace, log: Log) -> None:
     stored = read(model_file(args.folder))
     require_joints(stored.fitted.rig, "design")
     fitted, bench = _logs(args, stored)
-    question = vars(args)["for"]
-    open_of(question, fitted)
     check_places(args.out, args.sequences)
     with resumable(args, bench, log):
         designed = design(
-            fitted, bench.train.data, key=jax.random.key(args.seed), question=question,
+            fitted, bench.train.data, key=jax.random.key(args.seed),
             seconds=args.seconds, sequences=args.sequences, log=log,
         )  # fmt: skip
-        write_design(args.out, designed, question=question, seed=args.seed, began=began, log=log)
+        write_design(args.out, designed, seed=args.seed, began=began, log=log)
 
 
 def _logs(args: argparse.Namespace, stored: Stored) -> tuple[Identified, Bench]:

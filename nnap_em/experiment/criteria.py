@@ -49,9 +49,7 @@ class Criterion(NamedTuple):
     weight: Float[np.ndarray, "range dof node"]
     """Weight of velocities, in every range; their sum is 1."""
     friction: bool = True
-    """True where friction counts."""
-    places: tuple[int, ...] = ()
-    """Parameters that count, among all."""
+    """True where friction is learned."""
 
     def cost(self, expected: Information) -> Float[np.ndarray, "*proposal"]:
         """Cost of information, of friction and parameters together."""
@@ -61,6 +59,6 @@ class Criterion(NamedTuple):
             relative = variance[..., :size].reshape(*cost.shape, *shape) / self.scale[:, None] ** 2
             mean = np.einsum("...jn,rjn->...r", relative**2, self.weight)
             cost += 0.25 * np.mean(np.log(mean + 1e-30), axis=-1)
-        if self.places:
-            cost += 0.5 * np.mean(np.log(np.maximum(variance[..., np.add(self.places, size)], 1e-30)), axis=-1)
+        if variance.shape[-1] > size:
+            cost += 0.5 * np.mean(np.log(np.maximum(variance[..., size:], 1e-30)), axis=-1)
         return cost

@@ -54,7 +54,6 @@ def design(
     data: Dataset,
     *,
     key: PRNGKeyArray,
-    question: str = "all",
     seconds: float = 60.0,
     sequences: int = 6,
     effort: Effort = DESIGN_EFFORT,
@@ -69,7 +68,6 @@ def design(
         fitted: the model.
         data: the logs that it was fitted to.
         key: random key of the search.
-        question: "friction", "parameters", the name of one, or "all" of these.
         seconds: length of all sequences together [s].
         sequences: their number.
         effort: size of the search.
@@ -82,7 +80,9 @@ def design(
         DesignError: the rig has no input, a start is out of the limits, or nothing is open.
     """
     key_paths, key_noise, key_check, key_search = jax.random.split(key, 4)
-    friction, places = open_of(question, fitted)
+    friction = fitted.rig.friction
+    if not (friction or fitted.m_step.prior.size):
+        raise DesignError("nothing is open: the fit has no friction map and no parameter")
     rows = round(seconds / sequences / fitted.rig.dt)
     if rows < 20:
         raise DesignError(
@@ -96,7 +96,7 @@ def design(
     visited = path[followed][:, dof : 2 * dof]
     slow = np.percentile(np.abs(visited), 20, axis=0)  # speeds near rest: of 20 % of the rows,
     slow = np.maximum(slow, np.sort(np.abs(fit.nodes), axis=1)[:, 2])  # or up to the first nodes where it stood still
-    criterion = Criterion(fit, *_weighted(fit, visited, slow), friction, places)
+    criterion = Criterion(fit, *_weighted(fit, visited, slow), friction)
     t = fitted.rig.dt * np.arange(rows + 1)
     setup = Setup(fit, drawn_paths(fitted, TRIED, key=key_paths), limits, t, key_noise)
     row = _row_of_logs(setup, data, path, used)
@@ -111,21 +111,6 @@ def design(
     old = setup.share * sequences * t.size * row
     expected = plan.expected.sum(axis=0)
     return Design(fitted, limits, t, u, start, low, middle, high, fit, expected, old, criterion, slow)
-
-
-def open_of(question: str, fitted: Identified) -> tuple[bool, tuple[int, ...]]:
-    """True where a question is about friction, and places of the parameters that it is about.
-
-    Raises DesignError where the fit leaves nothing of that name open.
-    """
-    prior, friction = fitted.m_step.prior, fitted.rig.friction
-    every, known = tuple(range(prior.size)), {"friction": (True, ())} if friction else {}
-    known |= {"parameters": (False, every)} if every else {}
-    known |= {name: (False, (i,)) for i, name in enumerate(prior.declared)} | {"all": (friction, every)}
-    if question not in known or not (friction or every):
-        names = ", ".join(known) if friction or every else "none: the fit has no friction map and no parameter"
-        raise DesignError(f"--for {question}: not a question of this fit; possible here: {names}")
-    return known[question]
 
 
 def _weighted(fit: Fit, visited: Float[np.ndarray, "row dof"], slow: Float[np.ndarray, " dof"]):

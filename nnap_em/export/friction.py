@@ -1,6 +1,5 @@
 """Friction of a joint in the form that simulators and controllers have: Coulomb, Stribeck, viscous, constant."""
 
-import itertools
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -16,7 +15,7 @@ REPORTED_MISS = 0.1
 
 
 class FrictionForm(NamedTuple):
-    """Friction that opposes motion, and a constant torque.
+    """Friction that opposes motion, and a constant torque [N m, rad/s, or N, m/s].
 
         tau(v) = offset - (coulomb + (breakaway - coulomb) exp(-(v / stribeck)^2)) tanh(v / smooth) - viscous v
 
@@ -24,17 +23,13 @@ class FrictionForm(NamedTuple):
     """
 
     coulomb: float = 0.0
-    """[N m or N]"""
     breakaway: float = 0.0
-    """[N m or N]; the Coulomb torque where there is no dip."""
+    """The Coulomb torque where there is no dip."""
     stribeck: float = 1.0
-    """[rad/s or m/s]"""
     viscous: float = 0.0
-    """[N m s/rad or N s/m]"""
     offset: float = 0.0
-    """[N m or N]"""
     smooth: float = 0.0
-    """Velocity over which the sign changes [rad/s or m/s]."""
+    """Velocity over which the sign changes."""
     missed: float = 0.0
     """Root mean square of the rest of the curve, over that of the curve [1]."""
 
@@ -50,14 +45,12 @@ def friction_form(
     if not np.any(torque):
         return FrictionForm()
     weight = 1 / np.maximum(std, 0.05 * np.max(np.abs(torque), initial=1e-300))
-    fits = {kind: _form(v, torque, weight, *kind) for kind in itertools.product((False, True), repeat=2)}
-    fits = {kind: form for kind, form in fits.items() if not kind[1] or form.stribeck > form.smooth}
-    least = min(form.missed for form in fits.values())
-    simpler = 0.005  # least share of a learned curve that a dip or a constant must explain to be written [1]
-    # Least share that it must explain, over the standard deviation of the curve relative to the curve [1]
-    bar = max(simpler, 0.3 * float(np.sqrt(np.mean(std**2) / max(np.mean(torque**2), 1e-300))))
-    order = sorted(fits, key=sum)  # fewer terms first
-    return next(fits[kind] for kind in order if fits[kind].missed <= least + bar)
+    kinds = ((False, False), (False, True), (True, False), (True, True))  # constant, dip: fewer terms first
+    fits = [(form, dip) for constant, dip in kinds for form in [_form(v, torque, weight, constant, dip)]]
+    fits = [form for form, dip in fits if not dip or form.stribeck > form.smooth]
+    # Least share of the curve that a term must explain, at least a part of the curve's relative uncertainty [1]
+    bar = max(0.005, 0.3 * float(np.sqrt(np.mean(std**2) / max(np.mean(torque**2), 1e-300))))
+    return next(form for form in fits if form.missed <= min(each.missed for each in fits) + bar)
 
 
 def friction_forms(fitted: Identified) -> list[FrictionForm]:

@@ -17,14 +17,11 @@ class NoPlace(Exception):
 
 
 class Drive(NamedTuple):
-    """The way from a command to a torque: limit, delay, lag, gain, in this order."""
+    """The way from a command to a torque: limit in its unit, delay [s], lag [s], gain, in this order."""
 
     limit: float = math.inf
-    """Limit of the command, in its unit."""
     delay: float = 0.0
-    """[s]"""
     lag: float = 0.0
-    """Time constant [s]."""
     gain: float = 1.0
 
 
@@ -35,15 +32,13 @@ class OpenFile(NamedTuple):
     system: Tree
     """The machine with its estimated numbers, as it is at the first moment of the clock."""
     measured: tuple[str, ...]
-    """Columns of the readings."""
     dt: float
-    """Sample interval of the fit [s]."""
+    """Sample interval of the fit [s]; `step`: time step of the file [s]."""
     step: float
-    """Time step of the file [s]."""
     pull: Float[np.ndarray, "dof 4"]
     """Force of springs at every joint as a cubic of its coordinate, the constant first [N m or N]."""
     drives: dict[int, Drive]
-    """Drives by joint, counted from 1."""
+    """By joint, counted from 1."""
 
     def with_drive(self, joint: int, **changes: float) -> None:
         """Change the drive of one joint."""

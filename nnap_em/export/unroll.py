@@ -171,7 +171,6 @@ class _Writer:
         return [self.each(op, whole, *operands)] if op else _moved(equation, operands)
 
     def converted(self, old: str, new: str, operand: np.ndarray) -> np.ndarray:
-        """Numbers of another kind."""
         if new == "b":
             return self.each(_OPS["ne"], True, operand, 0)
         op = {("f", "i"): "whole", ("i", "f"): "real", ("b", "f"): "real"}.get((old, new))
@@ -184,7 +183,6 @@ class _Writer:
         return self.each(_OPS["pow"], whole, x, y)
 
     def reduced(self, op: Op, whole: bool, operand: np.ndarray, axes: Sequence[int]) -> np.ndarray:
-        """Entries along axes joined by an operation."""
         for axis in sorted(axes, reverse=True):
             joined = functools.reduce(lambda a, b: self.each(op, whole, a, b), np.moveaxis(operand, axis, 0))
             operand = np.asarray(joined, object)
@@ -281,10 +279,6 @@ def _kind(atom: Any) -> str:
     return atom.aval.dtype.kind
 
 
-def _shape(atom: Any) -> tuple[int, ...]:
-    return atom.aval.shape
-
-
 def _typed(value: np.ndarray, atom: Any) -> jax.Array:
     """Numbers alone, of the type that JAX has for them."""
     return jnp.asarray(value.tolist(), atom.aval.dtype).reshape(value.shape)
@@ -296,16 +290,15 @@ def _symbolic(value: np.ndarray) -> bool:
 
 def _refuse(equation: core.JaxprEqn) -> None:
     """Raise ExportError for an operation of which C has not the same one."""
-    name, params = equation.primitive.name, equation.params
-    reason = ""
-    if name in ("div", "rem", "not") and any(_kind(atom) in "iu" for atom in equation.invars):
-        reason = "of whole numbers"
-    if name == "select_n" and len(equation.invars) > 3:
-        reason = "of more than two cases"
-    if name == "round" and params["rounding_method"] != jax.lax.RoundingMethod.TO_NEAREST_EVEN:
-        reason = "away from zero"
-    if reason:
-        raise ExportError(f"JAX's {name!r} {reason} has no plain C form here")
+    name, whole = equation.primitive.name, any(_kind(atom) in "iu" for atom in equation.invars)
+    even = equation.params.get("rounding_method") == jax.lax.RoundingMethod.TO_NEAREST_EVEN
+    for refused, reason in (
+        (name in ("div", "rem", "not") and whole, "of whole numbers"),
+        (name == "select_n" and len(equation.invars) > 3, "of more than two cases"),
+        (name == "round" and not even, "away from zero"),
+    ):
+        if refused:
+            raise ExportError(f"JAX's {name!r} {reason} has no plain C form here")
 
 
 def _by_jax(equation: core.JaxprEqn, operands: list[np.ndarray]) -> list[np.ndarray]:
@@ -317,7 +310,7 @@ def _by_jax(equation: core.JaxprEqn, operands: list[np.ndarray]) -> list[np.ndar
 def _moved(equation: core.JaxprEqn, operands: list[np.ndarray]) -> list[np.ndarray]:
     """Operations that move numbers: the commonest by NumPy, others by JAX on their places."""
     name, params, first = equation.primitive.name, equation.params, operands[0]
-    shape = _shape(equation.outvars[0])
+    shape = np.shape(equation.outvars[0].aval)  # type: ignore[arg-type]
     if name in ("reshape", "squeeze"):
         return [first.reshape(shape)]
     if name == "broadcast_in_dim":
@@ -328,13 +321,8 @@ def _moved(equation: core.JaxprEqn, operands: list[np.ndarray]) -> list[np.ndarr
     if name == "stack":
         return [np.stack(operands, params["axis"])]
     if name == "slice":
-        return [
-            first[
-                tuple(
-                    map(slice, params["start_indices"], params["limit_indices"], params["strides"] or [1] * first.ndim)
-                )
-            ]
-        ]
+        strides = params["strides"] or [1] * first.ndim
+        return [first[tuple(map(slice, params["start_indices"], params["limit_indices"], strides))]]
     if name not in _MOVERS:
         raise ExportError(f"JAX's {name!r} has no plain C form here")
     moved = _STEERED.get(name, range(len(operands)))

@@ -66,21 +66,24 @@ class Observation(NamedTuple):
 
 
 class _Memory(NamedTuple):
-    """State of the filter between rows: all branches with the log of their weights, 0 for the likeliest and -inf for a
-    free place; memory of what lies between commands and drives, inputs that are held, what they set at the drives, and
-    what those of the row before set; readings that wait for the input of their row, NaN where none does; time on the
-    clock of the logs and since the first row, below 0 before it [s]; rows since the last start, up to `SETTLING`."""
+    """State of the filter between rows."""
 
     branches: Gaussian
     log_weight: Float[Array, " branch"]
+    """0 for the likeliest, -inf for a free place."""
     commands: Any
+    """Memory of what lies between commands and drives."""
     u: Float[Array, " column"]
+    """Inputs that are held, then what they and those of the row before set at the drives."""
     fed: Float[Array, " input"]
     past: Float[Array, " input"]
     late: Float[Array, " obs"]
+    """Readings that wait for the input of their row; NaN where none does."""
     time: Float[Array, ""]
+    """On the clock of the logs [s]; `age`: since the first row, below 0 before it."""
     age: Float[Array, ""]
     rows: Float[Array, ""]
+    """Rows since the last start, up to `SETTLING`."""
 
 
 class Observer(NamedTuple):
@@ -111,9 +114,8 @@ class _Row(NamedTuple):
     late: Float[Array, " obs"]
     gate: Float[Array, ""]
     held: Inputs
-    """Inputs over the interval before the row."""
+    """Inputs over the interval before the row; `here`: at its readings."""
     here: Inputs
-    """Inputs at its readings."""
     flags: Int[Array, ""]
     time: Float[Array, ""]
     age: Float[Array, ""]
@@ -261,14 +263,12 @@ def _bits(flags: dict[int, Bool[Array, ""]]) -> Int[Array, ""]:
 
 def _every(row: Callable, branches: Gaussian, best: Int[Array, ""], alone: Bool[Array, ""]):
     """`row` of every branch; of one only where the others are free places."""
-    if branches.mean.shape[0] == 1:
-        return jax.tree.map(lambda a: a[None], row(jax.tree.map(lambda a: a[0], branches)))
 
     def one(branches):
         outcome = row(jax.tree.map(lambda a: a[best], branches))
         return jax.tree.map(lambda a: jnp.broadcast_to(a, (branches.mean.shape[0], *a.shape)), outcome)
 
-    return jax.lax.cond(alone, one, jax.vmap(row), branches)
+    return one(branches) if branches.mean.shape[0] == 1 else jax.lax.cond(alone, one, jax.vmap(row), branches)
 
 
 def _branched(
@@ -286,8 +286,8 @@ def _branched(
     (mean, cov), log_weight, _ = whole
     best = jnp.argmax(log_weight)
     std = jnp.sqrt(jnp.diagonal(cov, axis1=1, axis2=2))
-    near = jnp.all(jnp.abs(mean - mean[best][None]) < TWIN * std[best][None], axis=1)
-    twin = near & jnp.all(jnp.abs(std - std[best][None]) < TWIN * std[best][None], axis=1) & (places != best)
+    near = lambda a: jnp.all(jnp.abs(a - a[best][None]) < TWIN * std[best][None], axis=1)  # noqa: E731
+    twin = near(mean) & near(std) & (places != best)
     share = jnp.where(twin, jnp.exp(log_weight - log_weight[best]), 0.0)
     log_weight = jnp.where(twin | (log_weight < log_weight[best] + math.log(BRANCH_END)), -jnp.inf, log_weight)
     return Gaussian(mean, symmetric(cov)), log_weight.at[best].add(jnp.log1p(jnp.sum(share)))

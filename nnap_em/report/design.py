@@ -29,11 +29,10 @@ SEQUENCES_ACROSS = 3
 """Sequences in one figure."""
 
 
-def write_design(out: Path, design: Design, *, question: str, seed: int, began: float, log: Log) -> None:
+def write_design(out: Path, design: Design, *, seed: int, began: float, log: Log) -> None:
     """Write a designed experiment into the folder `out`; `began` is `time.perf_counter()` at the start."""
     files = _write_sequences(out, design)
     document = describe(design) | {
-        "question": question,
         "inputs": [f"{INPUT_DIR}/{file}" for file in files],
         "motion": [f"{MOTION_DIR}/{file}" for file in files],
         "seed": seed,

@@ -78,10 +78,7 @@ def prediction_figure(
     """Predicted distributions of every state and sensor of a sequence; readings up to `given` [s] were used."""
     rows = np.asarray(data.valid[sequence])
     t, y = (np.asarray(part[sequence])[rows] for part in (data.t, data.y))
-    sides = {
-        label: [np.asarray(part[sequence])[rows] for part in (prediction.mean, prediction.std)]
-        for label, prediction in predicted.items()
-    }
+    sides = {side: [np.asarray(a[sequence])[rows] for a in (p.mean, p.std)] for side, p in predicted.items()}
     states = (*names.coordinates, *names.rates, *names.sensors)
     columns = 1 if len(states) <= ACROSS else 2
     deep = -(-len(states) // columns)
@@ -99,12 +96,9 @@ def prediction_figure(
         ax.axvspan(float(t[0]), given, color="#F1F1F1", lw=0, zorder=0)
         ax.axvline(given, color="#555555", lw=1.0)
         ax.set_ylabel(f"{symbol(name)} [{names.unit(name)}]" + ("" if name in names.measured else "\nnot measured"))
-    first = grid[0, 0]
-    note = first.text(given, 0.97, " prediction starts", transform=first.get_xaxis_transform(), va="top", fontsize=8)
-    note.set(clip_on=True, in_layout=False)  # it may stand behind the end of a short sequence
     for ax in grid[-1]:
         ax.set(xlabel="time [s]", xlim=(float(t[0]), float(t[-1])))
-    head(figure, f"One test sequence, predicted from its first {given:g} s", list(grid.ravel()))
+    head(figure, f"One test sequence, predicted from its first {given:g} s (grey)", list(grid.ravel()))
     return figure
 
 
@@ -116,8 +110,7 @@ def effect_figure(curve: Curve) -> Figure:
     band(ax, curve.x, curve.mean, curve.std, AFTER, "learned")
     ax.axhline(0, color=ZERO_LINE, lw=0.7, zorder=0)
     signal = " + ".join(symbol(name) for name in curve.signal.split(" + "))
-    ax.set(xlim=(curve.x[0], curve.x[-1]), xlabel=f"{signal} [{curve.signal_unit}]")
-    ax.set_ylabel(f"force at joint {curve.joint} [{curve.unit}]")
+    ax.set(xlabel=f"{signal} [{curve.signal_unit}]", ylabel=f"force at joint {curve.joint} [{curve.unit}]")
     head(figure, "What was found", [ax])
     return figure
 
@@ -127,12 +120,12 @@ def term_figure(term: dict[str, Any]) -> Figure:
     """An unknown term of equations, as the report has it: with its 90 % band, or of two signals as a surface."""
     figure = Figure(figsize=(5.4, 3.4), layout="constrained")
     ax, (places, values) = figure.subplots(), (np.asarray(term[key]) for key in ("places", "value"))
-    names = [f"{symbol(name)} [{unit}]".removesuffix(" []") for name, unit in term["signals"].items()]
-    names.append(f"{term['name']} [{term['unit']}]")
-    if len(names) == 2:
-        band(ax, places[:, 0], values, term["std"], AFTER, "learned")
+    x, *y = [f"{symbol(name)} [{unit}]".removesuffix(" []") for name, unit in term["signals"].items()]
+    name = f"{term['name']} [{term['unit']}]"
+    if y:
+        figure.colorbar(ax.tripcolor(places[:, 0], places[:, 1], values, shading="gouraud"), ax=ax, label=name)
     else:
-        figure.colorbar(ax.tripcolor(places[:, 0], places[:, 1], values, shading="gouraud"), ax=ax, label=names[2])
-    ax.set(xlabel=names[0], ylabel=names[1])
+        band(ax, places[:, 0], values, term["std"], AFTER, "learned")
+    ax.set(xlabel=x, ylabel=y[0] if y else name)
     head(figure, f"The unknown term {term['name']}", [ax])
     return figure

@@ -13,7 +13,7 @@ from typing import Any, Literal, NamedTuple
 import jinja2
 from matplotlib.figure import Figure
 
-from ..numerics.digits import finite, number
+from ..numerics.digits import number
 from ..storage.files import replace_own
 from .tables import json_text
 
@@ -76,10 +76,9 @@ def rendered(
     """The page of a document that JSON holds beside it: its verdict, sections, folded details, and what made it."""
     made = dict(document.get("versions") or {})
     made |= {f"model {name}": file for name, file in (document.get("models") or {}).items()}
-    made |= {name: document[name] for name in ("model", "seed") if name in document}
-    if finite(document.get("seconds")):
-        made["took"] = f"{number(document['seconds'])} s"
-    versions = section("Versions, files and time", Table([], [[k, str(v)] for k, v in made.items()]), folded=True)
+    made |= {name: document[name] for name in ("model", "seed", "seconds") if name in document}
+    rows = [[name, number(value) if isinstance(value, float) else str(value)] for name, value in made.items()]
+    versions = section("Versions, files and time", Table([], rows), folded=True)
     rig, system = document.get("rig") or "", document.get("system")
     return _template().render(
         title=f"{title} {rig}" + (f" ({system})" if system and system != rig else ""),

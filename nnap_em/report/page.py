@@ -35,7 +35,6 @@ def page(document: Mapping[str, Any], pictures: Sequence[Picture] = ()) -> str:
         section("What to measure next", document.get("next")),
     ]
     details = [
-        section("Screening rounds, in their order", *map(_round, document.get("rounds") or []), folded=True),
         section("Estimated parameters", *[numbers, document.get("undetermined")] * diagnosed, folded=True),
         section("Noise", _noise_table(document.get("noise") or {}), folded=True),
     ]
@@ -196,18 +195,6 @@ def _unused(document: _Entry) -> list[Part]:
         )
         out += [text, Table(["file", "column", "what", "how many", "first at"], rows, "left")]
     return out
-
-
-def _round(entry: _Entry) -> Section | None:
-    """Scores of a screening round and of its refits, the eight highest."""
-    columns = (("screened", entry.get("measure") or "expected gain [nat]"), ("refitted", "after a refit"))
-    tables = []
-    for name, measure in columns:
-        best = sorted(entry.get(name) or [], key=lambda each: -(each.get("gain") or 0.0))[:8]
-        tables.append(Table(["effect", measure], [[label(each), number(each["gain"])] for each in best]))
-    untried = f"{entry['untried']} more candidates over their bar were not tried." if entry.get("untried") else ""
-    untried = untried or ("" if any(table.rows for table in tables) else "No candidate was scored.")
-    return section(f"Over {number(entry['horizon_s'])} s: added {entry['accepted'] or 'nothing'}", untried, *tables)
 
 
 # --- numbers

@@ -1,6 +1,6 @@
 """Residuals of the declared model: the force that it lacks, and its one-step errors."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -14,10 +14,11 @@ from .tables import INNER
 
 
 class _Bins(NamedTuple):
+    """Mean of a force over bins of a cause, with the standard deviation of the mean, which is NaN of one sequence."""
+
     centre: Float[np.ndarray, " bin"]
     mean: Float[np.ndarray, " bin"]
-    half: Float[np.ndarray, " bin"]
-    """Half width of the 90 % band of the mean; NaN of a single sequence."""
+    std: Float[np.ndarray, " bin"]
     share: float
     """Part of the variance that the bins account for."""
 
@@ -36,37 +37,26 @@ def _binned(x: Float[np.ndarray, "seq time"], r: Float[np.ndarray, "seq time"], 
     left = force - mean[place[seen]]
     known = np.isfinite(left)
     share = 1 - np.mean(left[known] ** 2) / max(float(np.var(force[known])), 1e-300) if known.any() else 0.0
-    half = NORMAL_90 * np.sqrt(scatter) / np.maximum(rows, 1)
-    return _Bins(0.5 * (edges[1:] + edges[:-1]), mean, half, float(share))
+    std = np.sqrt(scatter) / np.maximum(rows, 1)
+    return _Bins(0.5 * (edges[1:] + edges[:-1]), mean, std, max(float(share), 0.0))
 
 
-_Cause = tuple[str, list[Float[np.ndarray, "seq time"]]]
-"""Label, and values of every side."""
-
-
-def _causes(residuals: Sequence[Residual], names: Names) -> list[_Cause]:
-    """Everything that may cause a force."""
-    dof = len(names.coordinates)
-    out = [
-        _cause(symbol(name), names.unit(name), [residual.state[..., j] for residual in residuals])
-        for j, name in enumerate((*names.coordinates, *names.rates))
+def _causes(residuals: Sequence[Residual], names: Names) -> Iterator[tuple[str, list[Float[np.ndarray, "seq time"]]]]:
+    """Label, and values of every side, of everything that may cause a force."""
+    dof, states = len(names.coordinates), (*names.coordinates, *names.rates)
+    signals: list[tuple[str, str, Callable]] = [
+        (symbol(name), names.unit(name), lambda r, j=j: r.state[..., j]) for j, name in enumerate(states)
     ]
     rotary = [j for j in range(dof) if names.rotary[j]]
     if len(rotary) > 1:
         label = " + ".join(symbol(names.coordinates[j]) for j in rotary) if len(rotary) < 4 else "sum of all angles"
-        out.insert(dof, _cause(label, "rad", [residual.state[..., rotary].sum(-1) for residual in residuals]))
-    out += [
-        _cause(f"input {name}", names.unit(name), [residual.u[..., i] for residual in residuals])
-        for i, name in enumerate(names.inputs)
-    ]
-    return [*out, _cause("time", "s", [residual.t for residual in residuals])]
-
-
-def _cause(label: str, unit: str, values: list[Float[np.ndarray, "seq time"]]) -> _Cause:
-    """A signal; an angle that makes more than a turn within one."""
-    if unit == "rad" and np.ptp(np.nanpercentile(values[0], INNER)) > 2 * np.pi:
-        return f"{label} wrapped [rad]", [(angle + np.pi) % (2 * np.pi) - np.pi for angle in values]
-    return f"{label} [{unit}]", values
+        signals.insert(dof, (label, "rad", lambda r: r.state[..., rotary].sum(-1)))
+    signals += [(f"input {name}", names.unit(name), lambda r, i=i: r.u[..., i]) for i, name in enumerate(names.inputs)]
+    for label, unit, of in (*signals, ("time", "s", lambda r: r.t)):
+        values = [of(residual) for residual in residuals]
+        if unit == "rad" and np.ptp(np.nanpercentile(values[0], INNER)) > 2 * np.pi:  # within a turn
+            label, values = f"{label} wrapped", [(angle + np.pi) % (2 * np.pi) - np.pi for angle in values]
+        yield f"{label} [{unit}]", values
 
 
 def _followed(residual: Residual) -> Residual:
@@ -74,25 +64,14 @@ def _followed(residual: Residual) -> Residual:
     return (residual if residual.used.any() else residual._replace(used=~residual.used)).followed()
 
 
-_Side = tuple[Residual, str, str]
-"""Residual, colour and name of a model."""
-
-
-def _sides(residual: Residual, after: Residual | None, labels: tuple[str, str]) -> list[_Side]:
+def _sides(residual: Residual, after: Residual | None, labels: tuple[str, str]) -> list[tuple[Residual, str, str]]:
+    """Residual, colour and name of every model."""
     sides = [(_followed(residual), BEFORE, labels[0])]
     return sides if after is None else [*sides, (_followed(after), AFTER, labels[1])]
 
 
-class _Panel(NamedTuple):
-    """The force at one joint against one cause, of every side."""
-
-    label: str
-    curves: list[_Bins]
-
-    @property
-    def share(self) -> float:
-        """Share of the variation under the declared model."""
-        return max(self.curves[0].share, 0.0)
+_Panel = tuple[str, list[_Bins]]
+"""The force at one joint against one cause: the label of the cause, and the curve of every side."""
 
 
 @styled
@@ -106,7 +85,7 @@ def residual_figure(residual: Residual, names: Names, after: Residual | None = N
     dof = len(names.coordinates)
     rows = [_panels([side for side, _, _ in sides], names, j, bins) for j in range(dof)]
     if dof > 2:
-        rows = [sorted(row, key=lambda panel: -panel.share)[:ACROSS] for row in rows]
+        rows = [sorted(row, key=_share, reverse=True)[:ACROSS] for row in rows]
     columns = min(ACROSS, len(rows[0]))
     deep = -(-len(rows[0]) // columns)
     figure = Figure(figsize=(2.45 * columns + 0.3, 1.75 * deep * dof + 0.75), layout="constrained")
@@ -115,14 +94,14 @@ def residual_figure(residual: Residual, names: Names, after: Residual | None = N
     for j, row in enumerate(rows):
         same_kind = [r for k, r in enumerate(reaches) if names.rotary[k] == names.rotary[j]]
         reach = max(reaches[j], 0.3 * max(same_kind))  # what matters little should look little
-        best = max(panel.share for panel in row)
+        best = max(map(_share, row))
         for c, (ax, panel) in enumerate(zip(grid[j], row, strict=False)):
-            for curve, (_, colour, label) in zip(panel.curves, sides, strict=True):
-                band(ax, curve.centre, curve.mean, curve.half / NORMAL_90, colour, label)
+            for curve, (_, colour, label) in zip(panel[1], sides, strict=True):
+                band(ax, curve.centre, curve.mean, curve.std, colour, label)
             ax.axhline(0, color=ZERO_LINE, lw=0.7, zorder=0)
-            ax.set(xlabel=panel.label, ylim=(-reach, reach))
-            weight = "bold" if panel.share == best > 0.1 else "normal"
-            ax.set_title(f"{100 * panel.share:.0f} %", fontsize=8, loc="right", pad=2, weight=weight)
+            ax.set(xlabel=panel[0], ylim=(-reach, reach))
+            weight = "bold" if _share(panel) == best > 0.1 else "normal"
+            ax.set_title(f"{100 * _share(panel):.0f} %", fontsize=8, loc="right", pad=2, weight=weight)
             if c % columns:
                 ax.tick_params(labelleft=False)
             else:
@@ -143,14 +122,19 @@ def _panels(residuals: Sequence[Residual], names: Names, joint: int, bins: int) 
         low, high = np.percentile(seen, INNER) if seen.size else (-1.0, 1.0)
         edges = np.linspace(low, high if high > low else low + 1.0, bins + 1)
         pairs = zip(values, residuals, strict=True)
-        out.append(_Panel(label, [_binned(x, residual.force[..., joint], edges) for x, residual in pairs]))
+        out.append((label, [_binned(x, residual.force[..., joint], edges) for x, residual in pairs]))
     return out
+
+
+def _share(panel: _Panel) -> float:
+    """Share of the variation that goes with a cause under the declared model."""
+    return panel[1][0].share
 
 
 def _reach(panels: Sequence[_Panel]) -> float:
     """Half height of the panels of a joint."""
-    curves = [curve for panel in panels for curve in panel.curves]
-    return 1.15 * max(1e-12, *(float(np.nanmax(np.abs(c.mean) + np.nan_to_num(c.half), initial=0.0)) for c in curves))
+    ends = [np.abs(curve.mean) + np.nan_to_num(NORMAL_90 * curve.std) for _, curves in panels for curve in curves]
+    return 1.15 * max(1e-12, *(float(np.nanmax(end, initial=0.0)) for end in ends))
 
 
 @styled

@@ -21,22 +21,11 @@ NORMAL_90 = 1.6449
 ACROSS = 4
 """Panels side by side at most."""
 STYLE: Any = {
-    "font.size": 9,
-    "axes.titlesize": 10,
-    "axes.titlelocation": "left",
-    "axes.labelsize": 9,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
-    "axes.axisbelow": True,
-    "grid.color": "#E3E3E3",
-    "grid.linewidth": 0.6,
-    "lines.linewidth": 1.5,
-    "legend.frameon": False,
-    "legend.fontsize": 9,
-    "savefig.dpi": 150,
-    "figure.dpi": 150,
-}
+    "font.size": 9, "axes.titlesize": 10, "axes.titlelocation": "left", "axes.labelsize": 9,
+    "axes.spines.top": False, "axes.spines.right": False, "axes.grid": True, "axes.axisbelow": True,
+    "grid.color": "#E3E3E3", "grid.linewidth": 0.6, "lines.linewidth": 1.5,
+    "legend.frameon": False, "legend.fontsize": 9, "savefig.dpi": 150, "figure.dpi": 150,
+}  # fmt: skip
 _Side = TypeVar("_Side")
 styled = rc_context(STYLE)
 """Decorator of a function that draws in this style."""

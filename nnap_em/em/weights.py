@@ -68,6 +68,10 @@ class Weights(eqx.Module):
         cut = w.shape[0] - self.prior.size
         return jnp.concatenate([jnp.full(cut, self.ridge, w.dtype), jnp.ones_like(w[cut:])])
 
+    def middle(self) -> Float[Array, " weight"]:
+        """Prior mean of the weights."""
+        return jnp.concatenate([self.centre, jnp.zeros(self.prior.size, self.centre.dtype)])
+
     @eqx.filter_jit
     def symmetry(self, unknown, w: Float[Array, " weight"]) -> Float[Array, "phi phi"]:
         """Prior precision of phi: friction opposes motion alike in both directions, unless the data contradict.
@@ -135,7 +139,7 @@ class Weights(eqx.Module):
         shape, size, cut = self.nodes.shape, self.nodes.size, w0.shape[0] - self.prior.size
         phi0 = self.phi(unknown, w0)
         precision = self.precision(w0)
-        middle = jnp.concatenate([self.centre, jnp.zeros(self.prior.size, self.centre.dtype)])
+        middle = self.middle()
         symmetry = self.symmetry(unknown, w0)
         score = score - symmetry @ phi0
         if self.known is not None:

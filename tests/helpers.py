@@ -40,6 +40,20 @@ def optimised() -> Iterator[None]:
         jax.config.update("jax_disable_most_optimizations", before)
 
 
+@contextlib.contextmanager
+def compiled() -> Iterator[list[str]]:
+    """Names of the programs that are compiled inside, or taken from the cache of an earlier run."""
+    names: list[str] = []
+
+    def listen(event: str, duration: float, **labels: object) -> None:
+        if event == "/jax/core/compile/backend_compile_duration":
+            names.append(str(labels.get("fun_name")))
+
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    yield names
+    jax.monitoring.unregister_event_duration_listener(listen)
+
+
 def nnap(*words: object) -> int:
     """Exit status of a command in this process."""
     return cli.main([str(word) for word in words])

@@ -31,7 +31,7 @@ from nnap_em.systems import specs
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 LAUNCH = "python -m nnap_em.launch"
 
-EVERY = "--seed 1 --quiet --profile --trust-readings"
+EVERY = "--seed 1 --quiet --trust-readings"
 RUNS: dict[str, tuple[str, ...]] = {
     "simulate DIR/new --system slide --sequences 2 --test 1 --steps 95 --seed 1 --measured x"
     " --process-noise 0.001 0.01 --measurement-noise 0.001 0.01": (),

@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import pytest
+from helpers import compiled
 from rigs import slide_logs, slide_rig
 
 from nnap_em import diagnose, findings
@@ -10,7 +11,6 @@ from nnap_em.diagnosis import search
 from nnap_em.diagnosis.findings import Finding, verdict
 from nnap_em.effects import catalogue
 from nnap_em.effects.position import TorsionalSpring
-from nnap_em.numerics.profile import profiling
 
 SPRING = TorsionalSpring.of(20.0, 1.0, 0.0, 0.0, joint=1)
 DRAG = catalogue["air_drag"](jnp.asarray(0.8), joint=1)
@@ -27,10 +27,10 @@ def test_a_spring_is_named_and_sized_and_other_recordings_compile_nothing(monkey
     assert k.unit == "N/m" and k.value == pytest.approx(20.0, rel=0.05) and abs(k.value - 20.0) < 3 * k.std
     assert diagnosis.complete and [step.accepted is None for step in diagnosis.steps] == [False, True]
     other = slide_logs(1, laws=(DRAG,), sequences=3, steps=92)
-    with profiling() as profile:
+    with compiled() as programs:
         diagnosis = diagnose(slide_rig(), other, key=jax.random.key(0))
     assert not findings(diagnosis) and diagnosis.after is diagnosis.before
-    assert {name: stages for name, stages in profile.spent.items() if stages["compile"]} == {}
+    assert programs == []
 
 
 CLAIMS = {  # errors before and after by channel, and what is said of them

@@ -102,7 +102,6 @@ def parser() -> argparse.ArgumentParser:
     add("design", "--sequences", "how many (6)", "N", _count, default=6)
     add("diagnose design", "--logs", "of that fit, where they were moved", "FOLDER", **several)
     add(f"{fits} design", "--quiet", "no lines of progress", **flag)
-    add(f"{fits} design", "--profile", "print the seconds of stages and programs", **flag)
     add("compare", "fits", model, "FIT", nargs="+")
     add("compare", "--out", "folder for the page and the numbers", "OUT")
     add("predict smooth export", "model", model, "MODEL")
@@ -141,8 +140,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
         # XLA takes tuning hints of its own for features of a processor, and logs an error for each kept program.
         os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # [github.com/openxla/xla/issues/44565]
-        from ..numerics.profile import profiling  # loads JAX
-        from . import common
+        from . import common  # loads JAX
 
         with warnings.catch_warnings():
             warnings.showwarning = _warn  # pyrefly: ignore[bad-assignment]  (called by place)
@@ -150,8 +148,7 @@ def main(argv: Sequence[str] | None = None) -> int:
                 warnings.simplefilter("always", kind)
             common.set_up()
             run = importlib.import_module(f".{_MODULES.get(args.command, args.command)}", __package__).run
-            with profiling(getattr(args, "profile", False)):
-                return run(args, silent if getattr(args, "quiet", False) else _log) or 0
+            return run(args, silent if getattr(args, "quiet", False) else _log) or 0
     except KeyboardInterrupt as stopped:
         _log(str(stopped) or "stopped; the files that were written are whole")
         return 130

@@ -21,7 +21,6 @@ from ..data.dataset import Dataset, horizon
 from ..model.base import AbstractModel, prepare
 from ..numerics.gaussian import Gaussian
 from ..numerics.parallel import each
-from ..numerics.profile import stage
 from ..numerics.random import keys_of
 from ..smoother.mixture import MixtureSmoother
 from ..smoother.posterior import AbstractSmoother, Posterior, likeliest
@@ -185,7 +184,6 @@ REST = 0.05
 """Change of the log-likelihood, twice running, at which EM is at rest [nat a sequence]."""
 
 
-@stage("EM")
 def fit(
     state: EMState,
     data: Dataset,

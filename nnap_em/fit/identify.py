@@ -38,7 +38,6 @@ from ..em.stated import widened
 from ..em.weights import Weights
 from ..model.state_space import StateSpaceModel, with_effects
 from ..numerics.digits import counted
-from ..numerics.profile import stage
 from ..smoother.gaussian import CubatureSmoother
 from ..smoother.posterior import AbstractSmoother
 from ..smoother.start import StartBank
@@ -128,7 +127,6 @@ def begin(
     return Identified(rig, start_state(full, rule, key=key_fit), rule, bank, smoother(bank))
 
 
-@stage("first fit")
 def identify(
     rig: Rig,
     data: Dataset | Logs,

@@ -18,7 +18,6 @@ from ..diagnosis.statistics import tests
 from ..fit.identify import FrictionTable, friction_table
 from ..fit.misfit import moved
 from ..fit.predict import Prediction
-from ..numerics.profile import stage
 from ..storage.log import Log
 from .document import errors, noise, parameters, predictions, shared
 from .fit_plots import effect_figure, error_figure, friction_figure, prediction_figure
@@ -29,7 +28,6 @@ from .tables import visited_nodes, write_friction
 from .wording import reached
 
 
-@stage("report")
 def write_diagnosis(
     out: Path,
     diagnosis: Diagnosis,

@@ -20,7 +20,6 @@ from ..fit.identify import FrictionTable, Identified, friction_table
 from ..fit.misfit import Moved, moved
 from ..fit.predict import posterior_of
 from ..numerics.digits import counted
-from ..numerics.profile import stage
 from ..storage.files import replace_bytes
 from ..storage.log import Log
 from .document import errors, friction_law, noise, parameters, predictions, shared, unknown_terms
@@ -31,7 +30,6 @@ from .tables import visited_nodes, write_friction
 from .wording import reached
 
 
-@stage("report")
 def write_identification(
     out: Path,
     fitted: Identified,

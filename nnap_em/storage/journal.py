@@ -20,7 +20,6 @@ import jax
 
 from ..numerics.digest import digest, surroundings
 from ..numerics.parallel import everywhere
-from ..numerics.profile import stage
 from .deadline import in_time
 from .files import Kind, StoreError, read_arrays, sweep, write_arrays
 from .leaves import describe, name_of, restore
@@ -91,7 +90,6 @@ def step(form: Callable[..., Any]) -> Callable[[_Step], _Step]:
 
     def make(function: _Step) -> _Step:
         @functools.wraps(function)
-        @stage(function.__module__.rpartition(".")[2])
         def remembered(*args, **options):
             journal = _journal.get()
             if journal is None:

@@ -22,6 +22,7 @@ import plant
 from matplotlib.figure import Figure
 
 import nnap_em
+from nnap_em.fit.observer import Observer
 from nnap_em.numerics.programs import use_older_emitters
 
 STIFFNESS, DAMPING, MOST = 1.5, 0.12, 0.8
@@ -47,7 +48,7 @@ class Run(NamedTuple):
         return float(np.sqrt(np.mean((self.true[:, 1] - self.target) ** 2)))
 
 
-def closed_loop(case: plant.Case, online: nnap_em.results.Observer, seconds: float, seed: int, reads: bool) -> Run:
+def closed_loop(case: plant.Case, online: Observer, seconds: float, seed: int, reads: bool) -> Run:
     """The plant under the controller; `reads`: with readings, else the observer is the model alone."""
     true, rng, rows = plant.build(case), np.random.default_rng([seed, 48]), round(seconds / plant.DT)
     start = np.array([[1.0, plant.THETA2_STD * rng.standard_normal(), 0.0, 0.0]])

@@ -1,7 +1,7 @@
 """Identify what a physics model of a machine does not know, from logs, and find what it lacks.
 
-The main jobs are functions of the package; the rest is in `smoothers`, `plots`, `export`, `systems`, `results`,
-`errors`, `paper` and `parallel`.  Each name is loaded at its first use, so that `import nnap_em` costs nothing.
+The main jobs are functions of the package; the rest is in `smoothers`, `plots`, `export`, `systems` and
+`errors`.  Each name is loaded at its first use, so that `import nnap_em` costs nothing.
 """
 
 import importlib
@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
-    from . import errors, export, paper, parallel, plots, results, smoothers, systems
+    from . import errors, export, plots, smoothers, systems
     from .comparison.compare import compare
     from .data.dataset import Dataset, pad
     from .data.logs import read_logs
-    from .data.rig import Rig, write_rig
+    from .data.rig import Rig
     from .diagnosis.findings import findings
     from .diagnosis.outcome import Diagnosis
     from .diagnosis.search import diagnose
@@ -31,14 +31,14 @@ if TYPE_CHECKING:
 __all__ = [
     "Dataset", "Diagnosis", "Identified", "Rig", "__version__", "check", "compare", "design", "diagnose", "errors",
     "export", "findings", "friction_table", "horizon_errors", "identify", "identify_from", "load", "observer", "pad",
-    "paper", "parallel", "parameter_table", "plots", "predict", "read_logs", "read_rig", "register",
-    "register_equations", "results", "save", "simulate", "smooth", "smoothers", "systems", "write_rig",
+    "parameter_table", "plots", "predict", "read_logs", "read_rig", "register", "register_equations", "save",
+    "simulate", "smooth", "smoothers", "systems",
 ]  # fmt: skip
 _homes = {
     "comparison.compare": "compare",
     "data.dataset": "Dataset pad",
     "data.logs": "read_logs",
-    "data.rig": "Rig write_rig",
+    "data.rig": "Rig",
     "diagnosis.findings": "findings",
     "diagnosis.outcome": "Diagnosis",
     "diagnosis.search": "diagnose",

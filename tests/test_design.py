@@ -26,6 +26,7 @@ from nnap_em.experiment.signals import FAMILIES, drawn, mutated, played
 from nnap_em.fit.identify import Identified, identify, parameter_table
 from nnap_em.fit.predict import drawn_paths
 from nnap_em.fit.store import save
+from nnap_em.model.simulate import examples
 from nnap_em.report.design import check_places, write_design
 from nnap_em.systems import specs
 
@@ -105,7 +106,7 @@ def test_information_along_the_logs_is_the_curvature_of_their_fit(slide):
 def test_what_is_promised_is_what_a_fit_then_states_and_the_truth_is_near(slide):
     """The design is played by the model that made the logs, with noise of its own."""
     rig, data, fitted = slide
-    truth = nnap_em.paper.examples["slide"]().model
+    truth = examples["slide"]().model
     plan = {"seconds": 3.8, "sequences": 4, "effort": SMALL}
     designed = design(fitted, data, key=jax.random.key(1), **plan)
     made = nnap_em.simulate(truth, jnp.asarray(designed.start), jnp.asarray(designed.u), key=jax.random.key(9)).data

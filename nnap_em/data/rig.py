@@ -261,7 +261,7 @@ def write_rig(rig: Rig, path: Path | str) -> None:
         path: the file.
 
     Example:
-        >>> nnap_em.write_rig(rig, f"{folder}/copy.toml")
+        >>> write_rig(rig, f"{folder}/copy.toml")
         >>> nnap_em.read_rig(f"{folder}/copy.toml") == rig
         True
     """

@@ -94,7 +94,7 @@ def paper_model(*, q_std=(2e-4, 1e-2), r_std=(0.01, 0.05), start_std: float = 0.
         The model.
 
     Example:
-        >>> nnap_em.paper.paper_model().system.coordinates
+        >>> paper_model().system.coordinates
         ('theta1', 'theta2')
     """
     a = lambda *values: jnp.asarray(values, dtype)  # noqa: E731
@@ -140,7 +140,7 @@ def paper_experiment(model: StateSpaceModel, sequences: int = 20, steps: int = 5
         The Dataset and the states behind it.
 
     Example:
-        >>> nnap_em.paper.paper_experiment(nnap_em.paper.paper_model(), 2, 5, key=key).data.u.shape
+        >>> paper_experiment(paper_model(), 2, 5, key=key).data.u.shape
         (2, 6, 1)
     """
     return sweep_experiment(model, paper_sweep, sequences, steps, key=key)

@@ -30,7 +30,6 @@ class Step(NamedTuple):
     tried: int
     """Candidates screened."""
     measure: str = "share of the squared error"
-    """Name of the share."""
     rivals: tuple[Key, ...] = ()
     """Laws of other causes that explain the same, so that none of them was added."""
     suspects: tuple[Suspect, ...] = ()

@@ -42,12 +42,9 @@ class Names(NamedTuple):
 
     def unit(self, name: str) -> str:
         """SI unit of a state, a sensor, an input or `time`."""
-        if name == "time":
-            return "s"
-        if name in self.units:
-            return self.units[name]
-        if name in self.sensors:
-            return self.sensors[name]
+        known = {"time": "s", **self.sensors, **self.units}
+        if name in known:
+            return known[name]
         if name in self.inputs:
             return self.force_unit(self.joints[self.inputs.index(name)])
         place = (self.coordinates + self.rates).index(name)
@@ -115,8 +112,8 @@ def names_of(fitted: Identified) -> Names:
 def _left(common, one) -> tuple[Float[Array, "time column"], ...]:
     """The fields of a `Residual` that come from smoothing, of one sequence."""
     model, (seq, posterior) = common, one
-    dof, plain, prepared = len(model.system.coordinates), with_effects(model, ()), prepare(model, seq)
-    states = len(model.system.states)
+    plain, prepared = with_effects(model, ()), prepare(model, seq)
+    dof, states = len(model.system.coordinates), len(model.system.states)
     pushed = slice(dof, states)  # rates; of equations, which have no coordinates, all states
     filtered = relinearised(model, posterior.state, prepared, CUBATURE)
 

@@ -365,9 +365,8 @@ def pair(make: Callable[..., AbstractEffect], probe: float, spread: float, *inne
 
 
 def contact(deep: Scalar, rate: Scalar, stiffness: Scalar, damping: Scalar, edge: float) -> Scalar:
-    """Force of a spring and a damper that are pressed in, on either side, and never pull.
-
-    The damper comes on within `edge`, so that a fit can move the place of contact.
+    """Force of a spring and a damper that are pressed in, on either side, and never pull. The damper comes on within
+    `edge`, so that a fit can move the place of contact.
     """
     push = stiffness * deep + damping * jnp.tanh(jnp.abs(deep) / edge) * rate
     return jnp.where(deep > 0, jnp.maximum(push, 0.0), jnp.minimum(push, 0.0))

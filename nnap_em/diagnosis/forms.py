@@ -28,9 +28,8 @@ class View(NamedTuple):
 
     name: str
     across: str
-    """Unit of the signal."""
     unit: str
-    """Unit of the force."""
+    """Units of the signal and of the force."""
     low: float
     length: float
     turns: bool

@@ -99,8 +99,7 @@ class Test(NamedTuple):
     p_value: float
     """Corrected for the number of tests [Holm 1979]."""
     size: float
-    """Distance from a right model, whatever the number of samples: largest autocorrelation; standard deviation minus 1;
-    correlation."""
+    """Distance from a right model: largest autocorrelation; standard deviation minus 1; correlation."""
     meaning: str
     """The result in one sentence."""
     slight: bool

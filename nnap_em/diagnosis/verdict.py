@@ -27,10 +27,9 @@ FAR = 3.0
 SURVIVES = 0.05
 """Smallest share of a law's columns that friction and parameters cannot give: on a slide under control that lacks a
 force 2 % of a false scale of its sensor, and 10 to 95 % of all other laws."""
-CERTAIN = 5.0
-"""Wald statistic [standard deviations] from which on an effect differs from none: 12.5 nat of log-likelihood."""
-DETERMINED = 2.0
-"""The same for its amplitude alone: amplitude and phase may cancel in a fit, so that neither is known."""
+CERTAIN, DETERMINED = 5.0, 2.0
+"""Wald statistics [standard deviations] from which on an effect differs from none, 12.5 nat of log-likelihood, and its
+amplitude alone: amplitude and phase may cancel in a fit, so that neither is known."""
 EQUIVALENT = 0.9
 """Share of the best from which on a law explains the same: a simpler law is then preferred to one that contains it,
 refits decide between others, and between laws of different causes the question stays open."""
@@ -42,11 +41,9 @@ KEEP = 0.6
 """Multiple of the floor that a refit must remove, and that must be lost without an effect for the effect to stay."""
 PAIR = 0.5
 """Prior odds of a pair of laws of equations to a single one: 120 pairs of the best sixteen laws are tried."""
-SUSPECT_SHARE = 0.08
-"""Share from which on a law of equations is listed as a suspect."""
-SUSPECT = 0.5
-"""Multiple of the floor from which on a law is listed as a suspect: on two real rigs as recorded the best of 600
-candidates removed 0.02 and 0.07 of the multi-step error."""
+SUSPECT, SUSPECT_SHARE = 0.5, 0.08
+"""Multiple of the floor from which on a law is listed as a suspect, on two real rigs as recorded the best of 600
+candidates removed 0.02 and 0.07 of the multi-step error; share from which on a law of equations is."""
 HELD = 0.2
 """Standard deviation of declared numbers in a search over the declared one: else they bend to what is missing."""
 FOLLOWED = 0.5

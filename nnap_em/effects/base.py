@@ -22,9 +22,8 @@ class OperatingPoint(NamedTuple):
 
     system: Any
     q: Float[Array, " dof"]
-    """Coordinates; of equations all states."""
     v: Float[Array, " rate"]
-    """Rates; of equations none."""
+    """Coordinates and rates; of equations all states, and none."""
     drive: Float[Array, " port"]
     """Generalised force of the inputs [N m]."""
     time: Scalar
@@ -57,9 +56,8 @@ class SearchScales(NamedTuple):
     dt: float
     """Sample interval, or what counts as one where sizes are grown from it [s]."""
     duration: tuple[float, float]
-    """First and last time on the clock [s]."""
     ending: float
-    """Last time of the whole recording, of which a part is looked at [s]."""
+    """First and last time on the clock, and last one of the whole recording, of which a part is looked at [s]."""
     session: bool
     """True where the clock runs on over all sequences."""
     learned: bool

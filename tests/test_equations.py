@@ -276,26 +276,6 @@ def test_derivatives_of_open_loop_errors_are_those_of_differences(chain):
         np.testing.assert_allclose(here.by_start[..., i], -slope, rtol=1e-5, atol=1e-7)
 
 
-def test_a_fit_to_open_loop_errors_is_where_their_likelihood_and_the_prior_are_highest(chain):
-    """By differences along each parameter and start; no error is beyond Huber's bend."""
-    fitted, data = chain[0], _chain(noise=0.05)
-    prior, begin_at = fitted.m_step.prior, simulated.filtered(fitted.model, data)
-    best = simulated.fit(fitted.model, prior, data, scale=np.full((1, 1, 1, 1), 1.0))
-
-    def loss(both):
-        start = both[2:].reshape(begin_at.mean.shape)
-        model = prior.write(fitted.model, jnp.asarray(both[:2]))
-        of = simulated.together([model], [prior], [start], data, begin_at)[0]
-        return of.error.size / 2 * np.log(np.mean(of.error**2)) + both @ both / 2
-
-    here, size = np.append(best.z, best.start), 0.02
-    for step in size * np.eye(here.size):
-        ahead, behind = loss(here + step), loss(here - step)
-        curvature = ahead + behind - 2 * loss(here)
-        # the Newton step along it, in standard deviations of the prior or radius of the start: small beside 1
-        assert curvature > 0 and abs((ahead - behind) / 2 / curvature * size) < 5e-3
-
-
 def test_a_simulation_that_runs_away_makes_no_step_singular():
     """Derivatives of 1e12 leave of the prior's 1 nothing in the sums; those of far errors do not count at all."""
     error, columns = np.full((1, 1, 40, 1), 0.1), np.ones((1, 1, 40, 1, 2))

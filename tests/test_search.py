@@ -149,7 +149,6 @@ def test_a_function_of_each_turn_and_one_of_all_turns_are_rivals():
 
 
 def test_a_stop_that_yields_is_none():
-    """One that a typical torque pushes in by half a radian, or whose ends nearly meet, is a spring in disguise."""
     stop = next(c for c in catalogue["hard_stop"].candidates(AROUND) if c.start.joint == 2).probes[0]
     half = np.log(2.0 * AROUND.torque[1])  # N m/rad
     assert dataclasses.replace(stop, stiffness=half + 0.01).is_physical()

@@ -444,8 +444,8 @@ curvature of the weights before the finish
 # diagnosis/columns.py
 ## test_multistep.py::test_a_probe_gives_the_same_column_beside_all_others_as_alone
 columns of a stack in the wrong places
-- full[:, stack.places] =
-+ full[:, stack.places[::-1]] =
+- full[:, index] =
++ full[:, index[::-1]] =
 # em/readings.py
 ## test_multistep.py::test_all_measured_coordinates_must_be_white_or_where_none_is_measured_one_reading
 one white coordinate is enough
@@ -857,8 +857,8 @@ the worst start of a law
 + return min(begun, key
 ## test_loop.py::test_a_spring_is_named_and_sized_and_other_recordings_compile_nothing
 what a refit leaves counts as what it removes
-- removed=1 - loss.ratio(null.end, end
-+ removed=loss.ratio(null.end, end
+- removed = certainty(form.candidate, effect, cov), 1 - loss.ratio(null.end, end
++ removed = certainty(form.candidate, effect, cov), loss.ratio(null.end, end
 # diagnosis/rounds.py
 ## test_search.py::test_a_round[another start]
 a law from one start

@@ -9,10 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 import plant
 import pytest
-from helpers import around, declared_model, rate
+from helpers import around, declared_model, rate, slide
 
 from nnap_em.data.dataset import Dataset
-from nnap_em.effects import catalogue, fields
+from nnap_em.diagnosis.keys import replaced
+from nnap_em.diagnosis.propose import seeded
+from nnap_em.effects import catalogue, fields, flat
+from nnap_em.effects.function import OVERTONES, PeriodicForce
 from nnap_em.model.state_space import with_effects
 
 STEPS, MOTOR = 60, plant.MOTOR_INERTIA
@@ -235,3 +238,26 @@ def test_a_linear_law_is_tried_from_no_strength():
         start, *probes = map(numbers, (candidate.start, *candidate.probes))
         moved = np.any([probe != start for probe in probes], axis=0)
         assert moved.any() and not start[moved].any(), candidate.start.name
+
+
+def test_every_period_that_the_recording_holds_is_near_one_that_is_tried():
+    """A wrong period is off by a fifth of a turn at the end of the recording; none is longer than the recording."""
+    model, _ = slide()
+    for span in (5.0, 12.0, 20.0):
+        every = PeriodicForce.candidates(around(model)._replace(duration=(0.0, span), ending=span))
+        tried = np.array([float(candidate.start.frequency) for candidate in every])
+        assert tried.min() * span >= 1.0
+        wanted = np.linspace(tried.min(), 4.0, 1000)
+        assert np.abs(wanted[:, None] - tried).min(axis=1).max() * span < 0.201
+
+
+def test_once_a_period_is_found_its_overtones_are_tried_in_the_place_of_the_sine():
+    model, _ = slide()
+    known = PeriodicForce(_a([0.4]), _a([0.1]), _a(0.96), harmonics=1, joint=1)
+    (full,) = known.richer(around(model))
+    assert replaced(full.start, with_effects(model, (known,))) == 0  # in its place, not beside it
+    time = jnp.linspace(0.0, 3.0, 40)
+    np.testing.assert_allclose(full.start.waveform(0.96 * time), known.waveform(0.96 * time), atol=1e-12)
+    grown = seeded(full, np.zeros(len(full.probes)))
+    np.testing.assert_array_equal(flat(grown), flat(full.start))
+    assert full.start.harmonics == OVERTONES and not full.start.richer(around(model))

@@ -1,7 +1,6 @@
 """Plants that are written as equations: formulas, declaration, model, errors over long horizons."""
 
 import dataclasses
-import json
 import math
 from pathlib import Path
 
@@ -25,8 +24,7 @@ from nnap_em.fit.check import check
 from nnap_em.fit.identify import begin, identify, parameter_table
 from nnap_em.fit.store import load, save
 from nnap_em.model.hooks import Sampling, reaching
-from nnap_em.model.state_space import Inputs
-from nnap_em.systems import Equations, register_equations, specs
+from nnap_em.systems import register_equations, specs
 from nnap_em.systems.expression import FormulaError, parse
 
 HEAD = 'format = 1\nname = "r"\n'
@@ -142,15 +140,6 @@ def test_a_declaration_is_the_same_after_writing_it(tmp_path):
     assert dict(rig.ranges) == {"y": (0.0, 10.0)}
 
 
-def test_a_step_is_that_of_the_matrix_exponential(chain):
-    model = dataclasses.replace(chain[0].model, substeps=20)
-    x, u = np.array([0.7, -0.2]), 1.5
-    whole = np.array([[-1 / 4, 0.0, 1.0], [1 / 2, -1 / 2, 0.0], [0.0, 0.0, 0.0]])
-    exact = (scipy.linalg.expm(0.5 * whole) @ np.append(x, u))[:2]
-    np.testing.assert_allclose(model.transition(jnp.asarray(x), Inputs.held(jnp.asarray([u]))), exact, rtol=1e-8)
-    np.testing.assert_allclose(model.emission(jnp.asarray(x), Inputs.held(jnp.asarray([u]))), [-0.2])
-
-
 def test_a_python_function_is_the_same_plant_as_its_text(tmp_path):
     def rate(x, u, p):
         return {"b": (x.a - x.b) / p.tb, "a": p.k * u.u - x.a / p.ta}
@@ -164,17 +153,6 @@ def test_a_python_function_is_the_same_plant_as_its_text(tmp_path):
     q, u, push = jnp.asarray([0.3, 0.8]), jnp.asarray([0.4]), jnp.asarray([0.1, -0.2])
     np.testing.assert_array_equal(first.slopes(q, q[:0], u, push), second.slopes(q, q[:0], u, push))
     assert python.input_columns == text.input_columns == ("u",)
-
-
-def test_an_unknown_term_is_a_port_where_its_name_stands():
-    of = {"terms": {"f": ["a"]}, "enters": {}, "units": {}, "function": "", "parameters": ["k"]}
-    of |= {"states": {"a": "m"}, "inputs": {}, "rates": {"a": "-k*f"}, "readings": {"y": "a + 2*f"}}
-    plant = Equations.declared({"k": jnp.asarray(3.0)}, (), json.dumps(of))
-    q, none = jnp.asarray([1.0]), jnp.zeros(0)
-    assert plant.ports == ("a", "f")
-    assert plant.senses_push
-    assert [float(a) for a in plant.slopes(q, none, none, jnp.asarray([0.5, 2.0]))] == [-5.5]
-    assert [float(a) for a in plant.sensed(q, none, none, jnp.asarray([0.5, 2.0]))] == [5.0]
 
 
 def test_time_constants_are_those_of_the_eigenvalues_and_every_row_is_in_one_window(chain):
@@ -298,26 +276,6 @@ def test_derivatives_of_open_loop_errors_are_those_of_differences(chain):
         np.testing.assert_allclose(here.by_start[..., i], -slope, rtol=1e-5, atol=1e-7)
 
 
-def test_a_fit_to_open_loop_errors_is_where_their_likelihood_and_the_prior_are_highest(chain):
-    """By differences along each parameter and start; no error is beyond Huber's bend."""
-    fitted, data = chain[0], _chain(noise=0.05)
-    prior, begin_at = fitted.m_step.prior, simulated.filtered(fitted.model, data)
-    best = simulated.fit(fitted.model, prior, data, scale=np.full((1, 1, 1, 1), 1.0))
-
-    def loss(both):
-        start = both[2:].reshape(begin_at.mean.shape)
-        model = prior.write(fitted.model, jnp.asarray(both[:2]))
-        of = simulated.together([model], [prior], [start], data, begin_at)[0]
-        return of.error.size / 2 * np.log(np.mean(of.error**2)) + both @ both / 2
-
-    here, size = np.append(best.z, best.start), 0.02
-    for step in size * np.eye(here.size):
-        ahead, behind = loss(here + step), loss(here - step)
-        curvature = ahead + behind - 2 * loss(here)
-        # the Newton step along it, in standard deviations of the prior or radius of the start: small beside 1
-        assert curvature > 0 and abs((ahead - behind) / 2 / curvature * size) < 5e-3
-
-
 def test_a_simulation_that_runs_away_makes_no_step_singular():
     """Derivatives of 1e12 leave of the prior's 1 nothing in the sums; those of far errors do not count at all."""
     error, columns = np.full((1, 1, 40, 1), 0.1), np.ones((1, 1, 40, 1, 2))
@@ -346,17 +304,6 @@ def test_the_fit_of_the_smaller_errors_is_kept(chain, fit, monkeypatch):
     table = parameter_table(identification.finished(fit, chain[1]))
     np.testing.assert_allclose([table["k"][0], table["ta"][0]], [1.3, 3.0], rtol=0.05)
     assert 0 < table["k"][1] < 0.1
-
-
-def test_independent_errors_are_those_of_an_autoregression():
-    """(1 - rho) / (1 + rho) of all; four standard deviations of twenty other seeds."""
-    rng, rho = np.random.default_rng(0), 0.8
-    error = rng.standard_normal((1, 50, 400, 1)) * np.sqrt(1 - rho**2)
-    for k in range(1, 400):
-        error[:, :, k] += rho * error[:, :, k - 1]
-    none = np.zeros((*error.shape, 0))
-    of = simulated.Simulated(None, None, np.zeros(0), np.zeros((1, 50, 0)), error, none, none)  # type: ignore[arg-type]
-    np.testing.assert_allclose(simulated.independent(of), error.size * (1 - rho) / (1 + rho), rtol=0.2)
 
 
 def test_an_input_that_takes_time_begins_as_it_is(chain):

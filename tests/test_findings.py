@@ -126,10 +126,9 @@ def test_what_cannot_be_told_is_a_verdict():
 
 def test_a_suspect_is_named_with_its_share_and_the_chance_level():
     (suspect,) = suspected(_closed(ARM)._replace(steps=(LAST,)))
-    assert (suspect.name, suspect.joint, suspect.share_of_error, suspect.chance) == ("motor_gain", 2, 0.18, 0.03)
-    assert suspect.description == (
-        "motor gain at joint 2 would remove 18% of the squared prediction error, where chance removes up to 3%"
-    )
+    assert [suspect[key] for key in ("name", "joint", "share_of_error", "chance")] == ["motor_gain", 2, 0.18, 0.03]
+    removes = "would remove 18% of the squared prediction error, where chance removes up to 3%"
+    assert suspect["description"] == f"motor gain at joint 2 {removes}"
     assert verdict([], None, 3, (), [suspect]).startswith("No effect is certain to be missing. Suspected: motor gain")
     assert "certain" not in verdict([], None) and not suspected(_closed(ARM))
     assert (

@@ -46,15 +46,6 @@ def test_a_law_changes_the_force_by_its_formula():
         np.testing.assert_allclose(_mass(q) @ change, force, atol=1e-10, err_msg=str(effect))
 
 
-def test_a_coarse_encoder_reads_multiples_of_its_step():
-    effect = plant.STRONG["sensor_quantization"][0]
-    case = SMALL._replace(effects=(effect,))
-    p = plant.build(case)
-    x = plant.simulate(p, plant.starts(case), plant.torques(case), plant.clocks(case))
-    steps = plant.readings(p, x)[..., 0] / effect["step"]
-    np.testing.assert_allclose(steps, np.round(steps), atol=1e-9)
-
-
 @pytest.mark.parametrize(
     "case",
     [

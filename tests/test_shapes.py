@@ -1,7 +1,5 @@
 """Curves made by formula, and learned from noisy readings in the basis of an unknown function, are told as they are."""
 
-import json
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -138,12 +136,3 @@ def test_words_have_bounds_where_the_basis_shows_no_more_and_units():
     assert loss.numbers["slope_above"][1] == "" and loss.words.endswith("above")
     once = shape(_learned(lambda x: 1.0 * ((x > -1) & (x < 1.5)), TURN, rng))
     assert once.words.startswith("a step up at theta1 = -1") and "and down again at 1.5" in once.words
-
-
-def test_the_entry_is_what_json_holds():
-    form = shape(_learned(lambda x: np.maximum(0, x - 0.4), PART, np.random.default_rng(4)))
-    entry = json.loads(json.dumps(form.entry()))
-    assert set(entry) == {"kind", "numbers", "explains", "resolution", "known", "rivals"}
-    assert entry["numbers"]["place"] == {"value": form.numbers["place"][0], "unit": "rad"}
-    assert entry["resolution"] == pytest.approx(NODE)
-    assert entry["known"] == pytest.approx([-1.5, 1.5], abs=0.1)

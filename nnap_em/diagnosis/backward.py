@@ -36,9 +36,8 @@ class _Reduced(NamedTuple):
 
 def backward(context: SearchContext, hypothesis: Hypothesis) -> Hypothesis:
     """Backward elimination: remove laws, the least needed first, without which a fit loses too little to count; then
-    put into the place of each law what may explain the same.
-
-    The models with and without a law are fitted in the same way, from their own smoothed paths.
+    put into the place of each law what may explain the same. The models with and without a law are fitted in the same
+    way, from their own smoothed paths.
     """
     while hypothesis.evidence:
         fit, _ = smooth(context, hypothesis, context.longest)
@@ -83,9 +82,8 @@ def _without(context: SearchContext, fit: SmoothedFit, full: Refit, place: int) 
 def judged_by(
     law: AbstractEffect, model: StateSpaceModel, measured: Sequence[str], bands: int
 ) -> list[tuple[int, tuple[int, ...]]]:
-    """Band and readings of the errors by which a law is judged; without readings, of those that are compared.
-
-    Noise that is fitted without a law of a rate makes this rate count for nothing: of others the law removes nothing.
+    """Band and readings of the errors by which a law is judged; without readings, of those that are compared. Noise
+    that is fitted without a law of a rate makes this rate count for nothing: of others the law removes nothing.
     """
     every: list[tuple[int, tuple[int, ...]]] = [(band, ()) for band in range(bands)]
     if law.channel in measured and (own := measured.index(law.channel)) not in channels(model):
@@ -96,9 +94,8 @@ def judged_by(
 def compared(
     hypothesis: Hypothesis, rivals: Callable[[int, AbstractEffect, Evidence], Iterable[tuple[Trial, float]]], log: Log
 ) -> Hypothesis:
-    """The hypothesis after the `rivals` of each law, with their leads, stood in its place.
-
-    One that is clearly worse is no equivalent any more; the first that is clearly better takes the place.
+    """The hypothesis after the `rivals` of each law, with their leads, stood in its place. One that is clearly worse is
+    no equivalent any more; the first that is clearly better takes the place.
     """
     found = list(hypothesis.evidence)
     for place, (law, evidence) in enumerate(zip(hypothesis.model.effects, hypothesis.evidence, strict=True)):
@@ -143,8 +140,6 @@ def _in_place(
 def rivals_of(
     law: AbstractEffect, evidence: Evidence, every: Sequence[Candidate], around: SearchScales, *, alone: bool
 ) -> list[Candidate]:
-    """Candidates that may stand in the place of a law: what explained the same when it was found and, beside other
-    laws, the same law elsewhere; `alone` it was compared with that when it was found.
-    """
+    """Candidates for the place of a law: its equivalents and, unless it was found `alone`, the law elsewhere."""
     seen = [(key_of(c.start), c) for c in every if c.start.visible(around)]
     return [c for key, c in seen if key in evidence.equivalent or (not alone and elsewhere(key, key_of(law)))]

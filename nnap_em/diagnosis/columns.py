@@ -25,19 +25,16 @@ class Track(NamedTuple):
     """The fitted model along the smoothed path of a sequence, in a form that does not depend on its structure."""
 
     middle: Float[Array, "*time state"]
-    """State (q, v) in the middle of every step."""
     acceleration: Float[Array, "*time dof"]
-    """Acceleration in the middle of every step [rad/s^2]."""
+    """State (q, v) and acceleration [rad/s^2] in the middle of every step."""
     drive: Float[Array, "*time dof"]
     """Generalised force of the inputs over every step [N m]."""
     friction: Float[Array, "*time dof"]
     """Torque of the learned map in the middle of every step [N m]."""
     true: Float[Array, "*time readable"]
-    """Readings of sensors without a fault in every row."""
     rate: Float[Array, "*time readable"]
-    """Time derivative of that."""
+    """Readings of sensors without a fault in every row, and their time derivative."""
     inputs: Inputs
-    """External inputs of the fitted model."""
 
 
 def tracks(null: StateSpaceModel, path: Gaussian, inputs: Inputs) -> Track:
@@ -86,21 +83,13 @@ def _columns(base: StateSpaceModel, effect: AbstractEffect, track: Track, scenes
 
 
 COLUMNS_AT_ONCE = 1024
-"""Columns that are computed and propagated at once: some 100 MB a sequence of a six-axis arm; machines of two joints
-have fewer in all."""
+"""Columns that are computed and propagated at once: some 100 MB a sequence of a six-axis arm."""
 
 
-class Stack(NamedTuple):
-    """Probes of one structure, and their places among all."""
-
-    places: list[int]
-    probes: AbstractEffect
-    axes: AbstractEffect
-    """Axis of the stack in every leaf; None where all are the same: what a basis shares is then computed once."""
-
-
-def _stack(places: list[int], probes: Sequence[AbstractEffect]) -> Stack:
-    """Stack made by NumPy: a stack of many small arrays would be one program for every number of them."""
+def _stack(probes: Sequence[AbstractEffect]) -> tuple[AbstractEffect, AbstractEffect]:
+    """Probes of one structure stacked, and the axis of the stack in every leaf, None where all are the same: what a
+    basis shares is then computed once.  By NumPy: a stack of arrays would be one program for every number of them.
+    """
     flat, structure = [jax.tree.leaves(probe) for probe in probes], jax.tree.structure(probes[0])
     stacked = [np.stack([np.asarray(leaf) for leaf in leaves]) for leaves in zip(*flat, strict=True)]
     constants = [bool((a == a[0]).all()) for a in stacked]
@@ -111,7 +100,7 @@ def _stack(places: list[int], probes: Sequence[AbstractEffect]) -> Stack:
     pad = lambda a: np.pad(a, [(0, more)] + [(0, 0)] * (a.ndim - 1), mode="edge")  # noqa: E731
     leaves = [np.asarray(a[0]) if constant else pad(a) for a, constant in zip(stacked, constants, strict=True)]
     axes = [None if constant else 0 for constant in constants]
-    return Stack(places, jax.tree.unflatten(structure, leaves), jax.tree.unflatten(structure, axes))
+    return jax.tree.unflatten(structure, leaves), jax.tree.unflatten(structure, axes)
 
 
 def _stack_columns(common, track: Track) -> list[Columns]:
@@ -135,15 +124,14 @@ def candidate_columns(
     base: StateSpaceModel, candidates: Sequence[Candidate], size: int = 0, rows: int = 0
 ) -> Callable[[Track], Columns]:
     """Columns that the probes of all candidates add to `base` along the tracks of some sequences: seq column time ...
-
-    They are padded by columns of 0 to `size`.  Tracks are padded to `rows` meanwhile: one program for all lengths.
+    They are padded by columns of 0 to `size`. Tracks are padded to `rows` meanwhile: one program for all lengths.
     """
     places, groups = {}, {}
     probes = [probe for candidate in candidates for probe in candidate.probes]
     for i, probe in enumerate(probes):
         places.setdefault(jax.tree.structure(probe), []).append(i)
     for index in places.values():
-        groups.setdefault(type(probes[index[0]]), []).append(_stack(index, [probes[i] for i in index]))
+        groups.setdefault(type(probes[index[0]]), []).append((index, _stack([probes[i] for i in index])))
     size = max(size, len(probes))
 
     def along(track: Track) -> Columns:
@@ -153,10 +141,10 @@ def candidate_columns(
         last = track.acceleration.shape[-1], len(base.measured)
         force, reading = (np.zeros((len(middle), size, length, n), middle.dtype) for n in last)
         for group in groups.values():  # a program for every class
-            every = each(_stack_columns, (base, [(stack.probes, stack.axes) for stack in group]), padded)
-            for stack, columns in zip(group, every, strict=True):
+            every = each(_stack_columns, (base, [stack for _, stack in group]), padded)
+            for (index, _), columns in zip(group, every, strict=True):
                 for full, values in ((force, columns.force), (reading, columns.reading)):
-                    full[:, stack.places] = np.asarray(values)[:, : len(stack.places), :length]
+                    full[:, index] = np.asarray(values)[:, : len(index), :length]
         return Columns(force, reading)
 
     return along

@@ -34,8 +34,7 @@ Stages = dict[int, tuple[EMState, Bool[np.ndarray, " seq"]]]
 SHORT = 150
 """Rows to which short horizons are cut, so that they share their programs."""
 LARGE_KICK, LATER = 5.0, (8, 3, 1)
-"""Kick [its standard deviations] from which on a sequence counts as diverged; rows after it that still count, the fewer
-where the many are too much."""
+"""Kick [its standard deviations] from which on a sequence counts as diverged; rows after it that still count."""
 
 
 class SearchContext(NamedTuple):
@@ -67,17 +66,11 @@ class SearchContext(NamedTuple):
         """Rows of the longest sequence."""
         return int(np.max(np.sum(np.asarray(self.data.valid), axis=1)))
 
-    @property
-    def declared(self) -> Hypothesis:
-        """The declared model."""
-        return declared(self.before)
-
 
 def smooth(context: SearchContext, hypothesis: Hypothesis, length: int) -> tuple[SmoothedFit, Bool[np.ndarray, " seq"]]:
-    """`hypothesis` along its smoothed paths over `length` rows, and the sequences that are followed whole.
-
-    A diverged sequence is most informative around its divergence: it is used up to `LATER` rows after that moment, the
-    longest stretch that the smoother still follows.
+    """`hypothesis` along its smoothed paths over `length` rows, and the sequences that are followed whole. A diverged
+    sequence is most informative around its divergence: it is used up to `LATER` rows after that moment, the longest
+    stretch that the smoother still follows.
     """
     before = context.before
     smoother, every = before.smoother, horizon(context.data, length)  # uncut: the program of the fit serves
@@ -89,7 +82,7 @@ def smooth(context: SearchContext, hypothesis: Hypothesis, length: int) -> tuple
     posterior = e_step(hypothesis.model, every, smoother, key=before.state.key)
     whole = np.asarray(not_diverged(posterior, every))
     path, data = cut_short((posterior.state, every))
-    fit = SmoothedFit(context.declared, hypothesis, path, data, whole, context.longest)
+    fit = SmoothedFit(declared(before), hypothesis, path, data, whole, context.longest)
     if whole.all():
         return fit, whole
     dof = len(hypothesis.model.system.coordinates)
@@ -109,10 +102,9 @@ def smooth(context: SearchContext, hypothesis: Hypothesis, length: int) -> tuple
 
 
 def extend(context: SearchContext, hypothesis: Hypothesis, first: int) -> EMState:
-    """EM of `hypothesis` from a horizon of `first` rows to the whole length, from the start that gives the best fit.
-
-    It starts from the hypothesis; or, where that is likelier over the first horizon, from friction and noise as
-    declared; and once more with looser noise where sequences diverge that the model without the law follows.
+    """EM of `hypothesis` from a horizon of `first` rows to the whole length, from the start that gives the best fit. It
+    starts from the hypothesis; or, where that is likelier over the first horizon, from friction and noise as declared;
+    and once more with looser noise where sequences diverge that the model without the law follows.
     """
     before, longest = context.before, context.longest
     schedule = Schedule(first=min(first, longest), growth=1.6, hold=1)
@@ -147,10 +139,9 @@ def extend(context: SearchContext, hypothesis: Hypothesis, first: int) -> EMStat
 
 def _afresh(context: SearchContext, hypothesis: Hypothesis) -> Callable[[], EMState] | None:
     """Fit with friction and noise from their start, and the same laws; None where `hypothesis` is likelier at first,
-    and where friction and noise are those of a fit.
-
-    Friction that was fitted without a law may stand in its place, too steep for the step of the integration, and no
-    step leads away from it: on an arm with 2.8 kg off an axis, 8 N m within 0.07 rad/s.
+    and where friction and noise are those of a fit. Friction that was fitted without a law may stand in its place, too
+    steep for the step of the integration, and no step leads away from it: on an arm with 2.8 kg off an axis, 8 N m
+    within 0.07 rad/s.
     """
     before = context.before
     if context.change:
@@ -172,19 +163,13 @@ def _afresh(context: SearchContext, hypothesis: Hypothesis) -> Callable[[], EMSt
 
 
 def _best(context: SearchContext, hypothesis: Hypothesis, fits: Sequence[EMState]) -> EMState:
-    """The fit that predicts best, or if that is better the hypothesis as it stands: EM, by one-step likelihood, may
-    leave what the errors of many steps had taught.
-    """
-    (own, used), *others = (
-        smooth(context, hypothesis.refitted(model), context.longest)
-        for model in (hypothesis.model, *(cast(StateSpaceModel, one.best) for one in fits))
-    )
-    before = errors(followed(own.model, own.m_step.prior, own.path, context.data), JUDGED)
-    left = []
-    for other, whole in others:
-        both = used & whole
-        after = errors(followed(other.model, other.m_step.prior, other.path, context.data), JUDGED)
-        left.append(ratio(before, after, both) if both.any() else 1.0)
+    """The fit that predicts best, or the hypothesis as it stands: EM may leave what errors of many steps taught."""
+    models, left = [hypothesis.model, *(cast(StateSpaceModel, one.best) for one in fits)], []
+    every = [smooth(context, hypothesis.refitted(model), context.longest) for model in models]
+    before, *after = (errors(followed(a.model, a.m_step.prior, a.path, context.data), JUDGED) for a, _ in every)
+    for error, (_, whole) in zip(after, every[1:], strict=True):
+        both = every[0][1] & whole
+        left.append(ratio(before, error, both) if both.any() else 1.0)
     place = chosen(left, [one.top for one in fits])
     if place is not None:
         return fits[place]
@@ -194,9 +179,8 @@ def _best(context: SearchContext, hypothesis: Hypothesis, fits: Sequence[EMState
 
 
 def chosen(left: Sequence[float], tops: Sequence[Float[np.ndarray, " seq"]]) -> int | None:
-    """Place of the fit to keep: of those whose squared error is nearly the least, the likeliest.
-
-    `left` are their errors over that of the hypothesis as it stands, which is kept where all predict worse.
+    """Place of the fit to keep: of those whose squared error is nearly the least, the likeliest. `left` are their
+    errors over that of the hypothesis as it stands, which is kept where all predict worse.
     """
     near = [i for i, share in enumerate(left) if share <= min(left) + LEAST_FALL]
     return functools.reduce(lambda a, b: b if ahead(tops[b], tops[a]) > 0 else a, near) if min(left) <= 1 else None
@@ -210,9 +194,8 @@ def ahead(a: Float[np.ndarray, " seq"], b: Float[np.ndarray, " seq"]) -> float:
 
 
 def quantised(context: SearchContext, hypothesis: Hypothesis) -> tuple[Hypothesis, EMState | None]:
-    """Readings that come in steps larger than their noise: seen in the numbers themselves, modelled as noise.
-
-    A fit that took the steps for motion has lost its way: it begins again where it was short.
+    """Readings that come in steps larger than their noise: seen in the numbers themselves, modelled as noise. A fit
+    that took the steps for motion has lost its way: it begins again where it was short.
     """
     rig, state, first = context.before.rig, None, min(context.stages)
     certain = 12.0  # gain in log-likelihood [nat] below which steps are no effect: chance exceeds it once in 10^6

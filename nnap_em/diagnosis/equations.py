@@ -1,8 +1,7 @@
 """Search for what equations lack: laws, and pairs of laws where no single one passes, by errors over long horizons.
 
-Every candidate is fitted with all parameters by open-loop errors, whose starts know nothing of the readings that they
-predict; the best are fitted again without parts of the recordings, and judged on these parts. A linear screen along
-smoothed paths would favour laws of the readings themselves.
+Every candidate is fitted with all parameters by open-loop errors; the best are fitted again without parts of the
+recordings, and judged on these. A linear screen along smoothed paths would favour laws of the readings themselves.
 """
 
 import itertools
@@ -55,9 +54,8 @@ class Case(NamedTuple):
     loss: float
     """Log of the posterior density, less."""
     share: float = math.nan
-    """Share of the squared error on parts left out that they remove."""
     left: float = math.nan
-    """Squared error on parts left out."""
+    """Share of the squared error on parts left out that they remove, and what they leave."""
     folds: tuple[float, ...] = ()
 
     @property
@@ -112,7 +110,6 @@ class Search(NamedTuple):
         self, hypothesis: Hypothesis, every: Sequence[tuple[Sequence[Candidate], Sequence[Any]]], **options: Any
     ) -> dict[int, Case]:
         """The hypothesis with each of some sets of laws, and the numbers that these begin with, fitted, by their place.
-
         What cannot be fitted, or not in time, is left out.
         """
         full = [self.with_laws(hypothesis, laws, starts) for laws, starts in every]
@@ -155,19 +152,16 @@ class Search(NamedTuple):
         return out
 
     def room(self, of: simulated.Simulated) -> float:
-        """Share of the squared error that is not noise of the readings: no law can remove more.
-
-        The noise is the smaller of that in the logs and that in the errors, half their mean square change from one to
-        the next [von Neumann 1941, Annals of Mathematical Statistics 12(4), 367].
+        """Share of the squared error that is not noise of the readings: no law can remove more. The noise is the
+        smaller of that in the logs and that in the errors, half their mean square change from one to the next [von
+        Neumann 1941, Annals of Mathematical Statistics 12(4), 367].
         """
         logs = np.array([reading_noise(y) for y in np.moveaxis(np.asarray(self.data.y), -1, 0)])
         change = np.ma.mean(np.diff(np.ma.masked_invalid(of.error), axis=2) ** 2, axis=(0, 1, 2)) / 2
         return 1 - float(np.mean(np.minimum(logs**2, np.ma.filled(change, np.inf)) / self.scale**2))
 
     def left_out(self, hypothesis: Hypothesis, cases: Sequence[Case]) -> dict[int, list[float]]:
-        """Squared errors of every case on every part by the fit to the others, by its place; only of those whose fits
-        all came to an end.
-        """
+        """Squared errors of every case on every part by the fit to the others; only where all fits came to an end."""
         every, out = [(case.laws, case.effects) for case in cases], {i: [] for i in range(len(cases))}
         for counts in folds(simulated.windows(self.before.model, self.data), len(self.data.t)) if cases else ():
             fits = self.fit(hypothesis, every, counts=~counts, steps=JUDGED_STEPS)
@@ -248,9 +242,8 @@ def search_equations(before: Identified, data: Dataset, log: Log, until: float =
 def _round(
     search: Search, hypothesis: Hypothesis, every: Sequence[Candidate], free: Sequence[Candidate]
 ) -> tuple[Case | None, tuple[Key, ...], Step]:
-    """The laws that pass, if any do, and single ones that explain the same.
-
-    Pairs, and functions without a name, are tried where no single law removes most of what can be removed.
+    """The laws that pass, if any do, and single ones that explain the same. Pairs, and functions without a name, are
+    tried where no single law removes most of what can be removed.
     """
     system, present = hypothesis.model.system, {key_of(effect) for effect in hypothesis.model.effects}
     effects = tuple(effect.lean(system) for effect in hypothesis.model.effects)
@@ -311,10 +304,9 @@ def _certain(case: Case) -> bool:
 
 
 def _chosen(passing: Sequence[Case]) -> tuple[Case | None, list[Case]]:
-    """The case of the fewest numbers among those that explain the same as the best, and all of these.
-
-    They are worth as much, and as likely on parts left out: few errors make much likely, and of a law that removes
-    nearly all the rest counts.
+    """The case of the fewest numbers among those that explain the same as the best, and all of these. They are worth as
+    much, and as likely on parts left out: few errors make much likely, and of a law that removes nearly all the rest
+    counts.
     """
     if not passing:
         return None, []

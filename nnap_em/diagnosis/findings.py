@@ -107,15 +107,14 @@ def verdict(
     error: Mapping[str, Any] | None,
     failed: int = 0,
     rivals: Sequence[Key] = (),
-    suspects: Sequence["SuspectReport"] = (),
+    suspects: Sequence[Mapping[str, Any]] = (),
     unfinished: str = "",
     opening: str = "The model lacks",
 ) -> str:
-    """The outcome in one sentence; `failed` tests of the one-step errors of the declared model failed clearly,
-    `rivals` explain the same of what is left, and `suspects` remove more than chance.  A second one has the reason
-    for which the search is `unfinished`. `opening` begins the sentence that names laws.
-
-    It names the column whose test error falls most, and trusts a finding where the geometric mean over all falls.
+    """The outcome in one sentence; `failed` tests of the one-step errors of the declared model failed clearly, `rivals`
+    explain the same of what is left, and `suspects` remove more than chance. A second one has the reason for which the
+    search is `unfinished`. `opening` begins the sentence that names laws. It names the column whose test error falls
+    most, and trusts a finding where the geometric mean over all falls.
     """
     if unfinished:
         known = accepted or rivals or suspects
@@ -127,7 +126,7 @@ def verdict(
     if not accepted and suspects:
         first, *remaining = suspects
         others = f" ({len(remaining)} more below)" if remaining else ""
-        return f"No effect is certain to be missing. Suspected: {first.description}{others}."
+        return f"No effect is certain to be missing. Suspected: {first['description']}{others}."
     if not accepted and failed:
         none = "No single effect of the catalogue is certain to be missing, but the declared model does not explain"
         return f"{none} everything: {failed} tests of its one-step errors fail."
@@ -153,9 +152,7 @@ def verdict(
 
 
 def changes(diagnosis: Diagnosis, accepted: Sequence[Finding], error: Mapping[str, Any] | None = None) -> str:
-    """The outcome of a search that began from a fit in one sentence: what changed since, or that nothing did, with the
-    test of whether errors have risen.
-    """
+    """The outcome of a search that began from a fit in one sentence: what changed since, or that nothing did."""
     if not diagnosis.complete:
         first = changes(diagnosis._replace(complete=True), accepted, error)
         return f"{first} {diagnosis.unfinished}: more may have changed."
@@ -163,7 +160,7 @@ def changes(diagnosis: Diagnosis, accepted: Sequence[Finding], error: Mapping[st
         return verdict(accepted, error, opening="Changed since the fit:")
     test, rivals = diagnosis.risen, listed([*map(words, undecided(diagnosis))])
     tied = f" {rivals[0].upper()}{rivals[1:]} explain the same; none is added." if rivals else ""
-    also = tied or "".join(f" Suspected: {suspect.description}." for suspect in suspected(diagnosis)[:1])
+    also = tied or "".join(f" Suspected: {suspect['description']}." for suspect in suspected(diagnosis)[:1])
     none = "Nothing is certain to have changed since the fit"
     if test is None:
         return f"{none}, whose own recordings are not at hand.{also}"
@@ -187,7 +184,6 @@ def growth(error: Mapping[str, Any]) -> dict[str, float]:
 
 
 def _texts(parameters: Mapping[str, Estimate]) -> dict[str, str]:
-    """Values with their standard deviations and units."""
     return {n: f"{with_std(p.value, p.std)} {p.unit}".rstrip(" -") for n, p in parameters.items()}
 
 
@@ -205,31 +201,17 @@ def _sized(finding: Finding) -> str:
     return f"{name} ({number(float(f'{np.ptp(curve.mean):.2g}'), 2)} {curve.unit} from trough to peak)"
 
 
-class SuspectReport(NamedTuple):
-    """A law that removes more of the error than chance and was not accepted, as it is reported."""
-
-    name: str
-    joint: int | None
-    channel: str | None
-    inputs: list[str]
-    share_of_error: float
-    """Share of the squared prediction error that it would remove [0 to 1]."""
-    chance: float
-    """Largest such share of any law whose columns are shifted in time [0 to 1]; NaN where none was tried."""
-    law: str
-    description: str
-    confirm: str
-
-
-def suspected(diagnosis: Diagnosis) -> list[SuspectReport]:
-    """Suspects of the last round, best first."""
+def suspected(diagnosis: Diagnosis) -> list[dict[str, Any]]:
+    """Suspects of the last round, best first, as the report has them: laws that remove more of the error than chance,
+    and were not accepted; `chance` is the largest share of a law whose columns are shifted in time, NaN without any.
+    """
     out = []
     for key, share, chance in [entry for step in diagnosis.last for entry in step.suspects]:
         text = f"{words(key)} would remove {share_of(share, 'the squared prediction error')}"
         by_chance = f"up to {chance:.0%}" if chance >= 0.005 else "less than 1%"
         text += f", where chance removes {by_chance}" if math.isfinite(chance) else ""
         more = {"law": words(key), "description": text, "confirm": catalogue[key[0]].confirm}
-        out.append(SuspectReport(**place_of(key), share_of_error=share, chance=chance, **more))
+        out.append(place_of(key) | {"share_of_error": share, "chance": chance} | more)
     return out
 
 
@@ -239,13 +221,13 @@ def undecided(diagnosis: Diagnosis) -> tuple[Key, ...]:
 
 
 def advice(
-    accepted: Sequence[Finding], rivals: Sequence[Key] = (), suspects: Sequence[SuspectReport] = ()
+    accepted: Sequence[Finding], rivals: Sequence[Key] = (), suspects: Sequence[Mapping[str, Any]] = ()
 ) -> list[str]:
     """Sentences on the next measurement."""
     out = [f"To discriminate {words(key)} from its rivals: {catalogue[key[0]].confirm}" for key in rivals]
     if suspects:  # what three recordings of a real arm left open, eleven decided
         out.append("To be sure of a suspect, record as many different motions again and diagnose all together.")
-    out += [f"To see {with_article(one.law)} by itself: {one.confirm}" for one in suspects if one.confirm]
+    out += [f"To see {with_article(one['law'])} by itself: {one['confirm']}" for one in suspects if one["confirm"]]
     for finding in accepted:
         if finding.effect.confirm:
             out.append(f"To be sure of the {words(key_of(finding.effect))}: {finding.effect.confirm}")

@@ -28,9 +28,8 @@ class View(NamedTuple):
 
     name: str
     across: str
-    """Unit of the signal."""
     unit: str
-    """Unit of the force."""
+    """Units of the signal and of the force."""
     low: float
     length: float
     turns: bool
@@ -100,7 +99,7 @@ def forms(view: View) -> list[Form]:
     ]
     bump = Form(_bells, _bump, product(around, widths), (0, 1), 3)
     local = [
-        Form(_lines, _line, np.zeros((1, 0)), (), 1),
+        Form(lambda view, place: view.z[None, :, None], _line, np.zeros((1, 0)), (), 1),
         Form(_steps, _step, product(within[2:-2], widths), (0, 1), 3),
         bump,
         Form(_bends, _bend, within[4:-4, None], (0,), 3),
@@ -111,13 +110,6 @@ def forms(view: View) -> list[Form]:
 def product(*axes: np.ndarray | list[float]) -> Places:
     """All combinations of the numbers of a place."""
     return np.stack([part.ravel() for part in np.meshgrid(*axes, indexing="ij")], axis=1)
-
-
-# --- at one place
-
-
-def _lines(view: View, place: Places) -> Columns:
-    return view.z[None, :, None]
 
 
 def _line(view: View, place: Place, size: Size) -> Description:
@@ -165,9 +157,6 @@ def _bump(view: View, place: Place, size: Size) -> Description:
     return Description(kind, {"place": at, "height": view.force(size[0]), "width": width}, words)
 
 
-# --- periodic
-
-
 def _ripples(view: View, place: Places) -> Columns:
     phase, both = 2 * np.pi * place * view.z, place < 0.49 / view.fine  # two nodes a period: one phase is seen
     return np.stack([np.cos(phase), both * np.sin(phase)], axis=2)
@@ -184,7 +173,6 @@ def _rate(view: View, wave: float) -> tuple[str, Quantity, str]:
 
 
 def _of(view: View, text: str) -> str:
-    """Rates in words."""
     if view.across == "rad":
         return f"{text} period{'' if text == '1' else 's'} a turn"
     return f"{text} Hz" if view.across == "s" else f"period {text} {view.across}"

@@ -24,8 +24,7 @@ class Evidence(NamedTuple):
     equivalent: tuple[Key, ...] = ()
     """Effects that the data cannot distinguish from it."""
     share: float = math.nan
-    """Share of the multi-step error that it removes on recordings left out of its fit; NaN of a law that was read
-    off, as the next."""
+    """Share of the multi-step error that it removes on recordings left out of its fit; of a law read off NaN."""
     chance: float = math.nan
     """Largest such share of any law whose columns are shifted in time."""
     parts: tuple[int, ...] = ()
@@ -57,26 +56,21 @@ class Hypothesis(NamedTuple):
         """The effects of the model, each with all that belongs to it."""
         prior = self.m_step.prior
         entries = zip(self.model.effects, blocks(self.model, self.m_step), self.evidence, strict=True)
-        return tuple(
-            Addition(effect, prior.mean[block], prior.std[block], evidence) for effect, block, evidence in entries
-        )
+        return tuple(Addition(effect, prior.mean[of], prior.std[of], evidence) for effect, of, evidence in entries)
 
     def having(self, additions: tuple[Addition, ...]) -> "Hypothesis":
         """The same declared model with other additions."""
         prior = self.m_step.prior
         declared = prior.size - sum(a.mean.shape[0] for a in self.additions)
         added = [f"{i}.{name}" for i, a in enumerate(additions) for name in fields(a.effect)]
-        joined = ParameterPrior(
-            prior.declared + tuple(added),
-            jnp.concatenate([prior.mean[:declared], *(a.mean for a in additions)]),
-            jnp.concatenate([prior.std[:declared], *(a.std for a in additions)]),
-        )
+        mean = jnp.concatenate([prior.mean[:declared], *(a.mean for a in additions)])
+        std = jnp.concatenate([prior.std[:declared], *(a.std for a in additions)])
+        joined = ParameterPrior((*prior.declared, *added), mean, std)
         model, first = with_effects(self.model, tuple(a.effect for a in additions)), self.m_step.log_q_prior
         own = 2 * len(model.system.coordinates)  # noise of a memory has no ratio to hold
         shape = model.log_q if first is None else model.log_q.at[:own].set(first[:own])
-        rule = eqx.tree_at(
-            lambda m: (m.prior, m.log_q_prior), self.m_step, (joined, shape), is_leaf=lambda leaf: leaf is None
-        )
+        fields_of, is_none = lambda m: (m.prior, m.log_q_prior), lambda leaf: leaf is None
+        rule = eqx.tree_at(fields_of, self.m_step, (joined, shape), is_leaf=is_none)
         return Hypothesis(model, rule, tuple(a.evidence for a in additions))
 
     def plus(self, effect: AbstractEffect, candidate: Candidate, evidence: Evidence | None = None) -> "Hypothesis":

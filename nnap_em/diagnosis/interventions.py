@@ -1,10 +1,8 @@
 """External disturbances: a force for a moment that nothing repeats, as from a hand, a collision, a cable that catches.
 
-The smoothed kicks are auxiliary residuals: where a force acts that the model lacks, they stand out for as long as it
-acts [Harvey & Koopman 1992, J. Bus. Econ. Stat. 10, 377; de Jong & Penzer 1998, J. Am. Stat. Assoc. 93, 796].  On a
-machine they stand out elsewhere too: friction, backlash, an input that jumps.  So a disturbance is compared with the
-missing force of the same recordings at all other times, and with that of neighbours in state space at other moments:
-a force that these share is a law of the machine.
+The smoothed kicks are auxiliary residuals, which stand out where a force acts that the model lacks [Harvey & Koopman
+1992, J. Bus. Econ. Stat. 10, 377; de Jong & Penzer 1998, J. Am. Stat. Assoc. 93, 796].  A force that recordings share
+at other times, or neighbours in state space at other moments, is a law of the machine.
 """
 
 import math
@@ -23,16 +21,14 @@ WINDOWS = (0.2, 0.4, 0.8)
 """Lengths of the Hann windows over which forces are averaged [s], each twice its width at half height."""
 WINDOW_DISTANCE = 0.03
 """Time between the windows that are compared [s]."""
-LEVEL = 4.0
-"""Smallest disturbance, in standard deviations: normal noise reaches it once in some thousand windows."""
-ALONE = 2.0
-"""Factor on `LEVEL` at a state that has no neighbours."""
+LEVEL, ALONE = 4.0, 2.0
+"""Smallest disturbance [standard deviations]: normal noise reaches it once in some thousand windows; factor on it at a
+state that has no neighbours."""
 SMALL = 0.05
 """Smallest disturbance, as a share of the typical torque of its joint."""
-NEIGHBOUR_DISTANCE, NEIGHBOURS = 1.2, 5
-"""Largest distance of a neighbour in state space, in radians or in rms of rates and inputs; number of neighbours."""
-VIEW, OTHERS = 0.5, 10
-"""The same two numbers for a comparison by the signals of one joint alone."""
+NEIGHBOUR_DISTANCE, NEIGHBOURS, VIEW, OTHERS = 1.2, 5, 0.5, 10
+"""Largest distance of a neighbour in state space, in radians or in rms of rates and inputs, and number of neighbours;
+both for a comparison by the signals of one joint alone."""
 REPEATED = 0.5
 """Share of a force from which on, as the mean of its neighbours, it is a law of the machine."""
 
@@ -68,9 +64,8 @@ def averaged(a: Float[np.ndarray, "seq time column"], rows: int) -> Float[np.nda
 
 
 def level(a: Float[np.ndarray, "seq window"]) -> Float[np.ndarray, "seq 1"]:
-    """Robust standard deviation: disturbances for some tenths of the time do not change it.
-
-    The larger of two: of all recordings by the 80 % quantile, since tails are heavy; of one recording by its median.
+    """Robust standard deviation: disturbances for some tenths of the time do not change it. The larger of two: of all
+    recordings by the 80 % quantile, since tails are heavy; of one recording by its median.
     """
     size = np.abs(a)
     if not np.isfinite(size).any():
@@ -82,9 +77,7 @@ def level(a: Float[np.ndarray, "seq window"]) -> Float[np.ndarray, "seq 1"]:
 def window_mean(
     force: Float[np.ndarray, "seq time dof"], rows: int
 ) -> tuple[Float[np.ndarray, "seq time dof"], Float[np.ndarray, "seq time dof"]]:
-    """Means over `rows` rows, NaN where a window does not fit inside its recording, and their standard deviation
-    without disturbances, which is larger where the force scatters, as where gears chatter.
-    """
+    """Means over `rows` rows, and their standard deviation without disturbances, larger where gears chatter."""
     mean = averaged(force, rows)
     scatter = np.sqrt(np.maximum(averaged(force**2, rows) - mean**2, 0.0)) + 1e-300
     std = np.full(mean.shape, np.nan)
@@ -120,10 +113,9 @@ def places(residual: Residual, names: Names, dt: float) -> Places:
         return a / (np.sqrt(np.mean(a**2, axis=0)) + 1e-300)
 
     v, u = scaled(v), scaled(u)
-    angle = [
-        np.stack([np.sin(x), np.cos(x)], axis=1) if turns else scaled(q[..., j : j + 1] - np.mean(x))
-        for j, (x, turns) in enumerate(zip(q[seq, row].T, names.rotary, strict=True))
-    ]
+    angle = [np.stack([np.sin(x), np.cos(x)], axis=1) for x in q[seq, row].T]
+    for j in np.flatnonzero(~np.array(names.rotary, bool)):
+        angle[j] = scaled(q[..., j : j + 1] - np.mean(q[seq, row, j]))
     subspaces = [np.concatenate([angle[j], v[:, j : j + 1]], axis=1) for j in range(dof)]
     subspaces += [np.stack([u[:, i], v[:, joint - 1]], axis=1) for i, joint in enumerate(names.joints)]
     return Places(seq, row, np.concatenate([*angle, v, u], axis=1), tuple(subspaces))
@@ -165,10 +157,9 @@ def repeated(mean: Float[np.ndarray, " place"], samples: Places, at: int, separa
 def disturbances(
     residual: Residual, names: Names, dt: float, least: Float[np.ndarray, " dof"]
 ) -> tuple[Intervention, ...]:
-    """External disturbances in the missing force, in the order of recordings and times.
-
-    The geometric mean of two numbers is at least `LEVEL` standard deviations: the size of the force, and its difference
-    from the force on neighbours in state space at other moments.  `least`: smallest size for each joint [N m, or N].
+    """External disturbances in the missing force, in the order of recordings and times. The geometric mean of two
+    numbers is at least `LEVEL` standard deviations: the size of the force, and its difference from the force on
+    neighbours in state space at other moments. `least`: smallest size for each joint [N m, or N].
     """
     known = residual.valid & residual.used[:, None] & np.isfinite(residual.state).all(axis=-1)
     force = np.where(known[..., None], residual.force, np.nan)
@@ -228,9 +219,8 @@ def _extent(mean: Float[np.ndarray, " time"], row: int, sign: float) -> tuple[in
 
 
 def interventions(fitted: Identified, data: Dataset) -> tuple[Intervention, ...]:
-    """External disturbances in `data`, by the smoother of the fit; none where a coordinate is not measured.
-
-    A hidden joint answers whatever pushes the others, so that the pushes cannot be located there.
+    """External disturbances in `data`, by the smoother of the fit; none where a coordinate is not measured. A hidden
+    joint answers whatever pushes the others, so that the pushes cannot be located there.
     """
     rig, system = fitted.rig, fitted.model.system
     if fitted.model.hides:

@@ -89,6 +89,5 @@ def contains(free: AbstractEffect, law: AbstractEffect, system: AbstractSystem) 
 
 
 def _same_signals(one: AbstractEffect, other: AbstractEffect, model: StateSpaceModel) -> bool:
-    """True if both are functions of the same signals at the same joint."""
     first, second = (set(effect.signals(model.system)) for effect in (one, other))
     return bool(first) and first == second and one.joint == other.joint

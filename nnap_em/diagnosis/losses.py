@@ -1,8 +1,7 @@
 """Multi-step errors of a fitted model about its smoothed paths, and what candidates would change of them.
 
 A smoothed path has absorbed part of a missing force as process noise.  The errors are therefore open-loop errors of the
-filter, and every derivative passes through the same gains: what the filter takes out of the errors is taken out of the
-columns, too.
+filter, whose gains take out of the columns what they take out of the errors.
 """
 
 from collections.abc import Iterator
@@ -39,10 +38,9 @@ class Linearised(NamedTuple):
 
 
 class MultiStep(eqx.Module):
-    """Open-loop errors of the measured coordinates some time ahead, by band of horizons.
-
-    Where noise is not as modelled, missing forces appear here: their effect adds up over many steps, that of bad
-    readings does not.  On fast machines, whose errors saturate early, they appear at the shorter horizons only.
+    """Open-loop errors of the measured coordinates some time ahead, by band of horizons. Where noise is not as
+    modelled, missing forces appear here: their effect adds up over many steps, that of bad readings does not. On fast
+    machines, whose errors saturate early, they appear at the shorter horizons only.
     """
 
     measure: ClassVar[str] = "share of the squared multi-step error"
@@ -58,10 +56,7 @@ class MultiStep(eqx.Module):
         return float(np.prod([1 - share for share in removed if np.isfinite(share)]))
 
     def linearise(self, fit: SmoothedFit, blocks: Blocks) -> Iterator[tuple[Linearised, ...]]:
-        """Errors and derivatives along the smoothed paths of `fit`, by band, for one block of candidates at a time.
-
-        Predictions begin from the filter every 50 ms, and weights are robust.
-        """
+        """Errors from a start every 50 ms, and derivatives, by band, for one block of candidates at a time."""
         model, path, data = fit.model, fit.path, fit.data
         weights = fit.m_step.weights(model)
         machine = eqx.tree_at(lambda m: m.unknown, fit.declared.model, model.unknown)  # on which candidates act
@@ -98,7 +93,6 @@ class MultiStep(eqx.Module):
 
     def ratio(self, null: Refit, full: Refit, fit: SmoothedFit, band: int, see: tuple[int, ...] = ()) -> float:
         """Squared error of one fit over that of another, on the sequences that `fit` uses, at a band of horizons.
-
         Squares are robust, each fit along its own smoothed paths; of the readings `see`, or those that are compared.
         """
         before, after = (multistep.errors(cast(Any, t.along), self.judged[band], see) for t in (null, full))

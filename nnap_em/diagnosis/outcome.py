@@ -14,9 +14,8 @@ class Suspect(NamedTuple):
 
     key: Key
     share: float
-    """Share of the squared multi-step error, before any refit [0 to 1]."""
     chance: float
-    """Largest share of any placebo that the parts left out confirm; NaN where none was tried."""
+    """Shares of the squared multi-step error before any refit [0 to 1], and of the best placebo, NaN without one."""
 
 
 class Step(NamedTuple):
@@ -30,7 +29,6 @@ class Step(NamedTuple):
     tried: int
     """Candidates screened."""
     measure: str = "share of the squared error"
-    """Name of the share."""
     rivals: tuple[Key, ...] = ()
     """Laws of other causes that explain the same, so that none of them was added."""
     suspects: tuple[Suspect, ...] = ()

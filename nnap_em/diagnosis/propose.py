@@ -21,9 +21,8 @@ from .keys import key_of
 def surroundings(
     rig: Rig, model: StateSpaceModel, data: Dataset, path: Gaussian, rows: int, *, change: bool = False
 ) -> SearchScales:
-    """Sizes on the smoothed paths and in the logs, of which `data` is a part: a whole sequence has `rows`.
-
-    `change`: candidates are what may have changed since the fit of `model`, too.
+    """Sizes on the smoothed paths and in the logs, of which `data` is a part: a whole sequence has `rows`. `change`:
+    candidates are what may have changed since the fit of `model`, too.
     """
     free = {name: float(d.mean) for name, d in rig.bodies.items() if d.std > 0}
     moved = tuple((name, rig.unit(name), abs(value) or 1.0) for name, value in free.items())
@@ -64,9 +63,8 @@ def proposals(
     known: Sequence[AbstractEffect] = (),
     kinds: Collection[type[AbstractEffect]] = catalogue.values(),
 ) -> list[Candidate]:
-    """Everything of some kinds that this machine could have, and other forms of what is `known` to be there.
-
-    A law of no size is left out, such as another centre of mass as a share of one that is declared on the axis.
+    """Everything of some kinds that this machine could have, and other forms of what is `known` to be there. A law of
+    no size is left out, such as another centre of mass as a share of one that is declared on the axis.
     """
     every = [candidate for kind in kinds for candidate in kind.candidates(around) if np.all(flat(candidate.prior_std))]
     keys = {key_of(candidate.start) for candidate in every}

@@ -1,7 +1,7 @@
 """Quick refits of a fitted model with something added, from its smoothed path on.
 
-Each pass linearises the model about the path, smooths, and takes one M-step.  Only the linearisation depends on the
-structure of the model; the rest is one compiled program for all of them, so that a new effect costs seconds.
+Each pass linearises the model about the path, smooths, and takes one M-step.  Only the linearisation is another program
+for another structure, so that a new effect costs seconds.
 """
 
 from typing import NamedTuple
@@ -62,9 +62,8 @@ def refit(
     passes: int = 8,
 ) -> Refit:
     """`model` after `passes` passes from `path`, fitted to the sequences `used`; the likelihood is of all of them.
-
     Passes have the rule of short horizons, its noise ratios held at those of `model`; the outcome, with its precision,
-    is stated under `m_step`.  The process and reading noise stay as they are in the first passes, while the path finds
+    is stated under `m_step`. The process and reading noise stay as they are in the first passes, while the path finds
     its place: they would fit the way there, and their estimates decay slowly.
     """
     brief = eqx.tree_at(lambda r: r.log_q_prior, m_step.while_growing(), model.log_q, is_leaf=lambda leaf: leaf is None)

@@ -36,18 +36,14 @@ class Names(NamedTuple):
     """Joint (counted from 1) that each input drives."""
     measured: tuple[str, ...]
     sensors: Mapping[str, str] = {}
-    """Those that read no state, with their units; of equations all that can be read."""
     units: Mapping[str, str] = {}
-    """Units of equations."""
+    """Units of what reads no state, or of equations of all that can be read; and of equations."""
 
     def unit(self, name: str) -> str:
         """SI unit of a state, a sensor, an input or `time`."""
-        if name == "time":
-            return "s"
-        if name in self.units:
-            return self.units[name]
-        if name in self.sensors:
-            return self.sensors[name]
+        known = {"time": "s", **self.sensors, **self.units}
+        if name in known:
+            return known[name]
         if name in self.inputs:
             return self.force_unit(self.joints[self.inputs.index(name)])
         place = (self.coordinates + self.rates).index(name)
@@ -69,19 +65,17 @@ class Residual(NamedTuple):
     innovation: Float[np.ndarray, "seq time obs"]
     """Reading minus its one-step prediction, over the standard deviation of that; NaN where not measured."""
     force: Float[np.ndarray, "seq time port"]
-    """Generalised force that the model lacks between a row and the next [N m, or N], of equations the missing rate of
-    every state; NaN behind the last row."""
     force_std: Float[np.ndarray, "seq time port"]
-    """Standard deviation of it given all readings."""
+    """Generalised force that the model lacks between a row and the next [N m, or N], of equations the missing rate of
+    every state, and its standard deviation given all readings; NaN behind the last row."""
     partial_force: Float[np.ndarray, "seq time port"]
     """The force that the model without its effects lacks, on the paths smoothed with them: the component-plus-residual
     of a regression.  The paths of a model that lacks much are wrong themselves.
     [Larsen & McCleary 1972, Technometrics 14, 781]"""
     partial_force_std: Float[np.ndarray, "seq time port"]
     state: Float[np.ndarray, "seq time state"]
-    """Smoothed coordinates and rates."""
     predicted: Float[np.ndarray, "seq time state"]
-    """Coordinates and rates predicted from the rows before; the innovations of a right model do not depend on them."""
+    """Coordinates and rates, smoothed, and predicted from the rows before."""
     u: Float[np.ndarray, "seq time input"]
     """Generalised forces of the inputs at their joints, with the effects of the model [N m, or N]."""
     t: Float[np.ndarray, "seq time"]
@@ -115,8 +109,8 @@ def names_of(fitted: Identified) -> Names:
 def _left(common, one) -> tuple[Float[Array, "time column"], ...]:
     """The fields of a `Residual` that come from smoothing, of one sequence."""
     model, (seq, posterior) = common, one
-    dof, plain, prepared = len(model.system.coordinates), with_effects(model, ()), prepare(model, seq)
-    states = len(model.system.states)
+    plain, prepared = with_effects(model, ()), prepare(model, seq)
+    dof, states = len(model.system.coordinates), len(model.system.states)
     pushed = slice(dof, states)  # rates; of equations, which have no coordinates, all states
     filtered = relinearised(model, posterior.state, prepared, CUBATURE)
 

@@ -85,10 +85,9 @@ def decided(
 
 
 def _group(admitted: Sequence[Screened], model: StateSpaceModel) -> list[Screened]:
-    """Laws that are refitted beside each other: the best of the first band, and each of them at its other places.
-
-    A law that a free function contains, or the reverse, comes in the form that explains as much as the better one, and
-    as itself where that is the function: a refit may show that it explains as much.
+    """Laws that are refitted beside each other: the best of the first band, and each of them at its other places. A law
+    that a free function contains, or the reverse, comes in the form that explains as much as the better one, and as
+    itself where that is the function: a refit may show that it explains as much.
     """
     band = [s for s in admitted if s.band == min(s.band for s in admitted)]
     values = [s.ratio for s in band]
@@ -102,9 +101,8 @@ def _group(admitted: Sequence[Screened], model: StateSpaceModel) -> list[Screene
 
 
 def _accepted(admissible: list[Trial], outcome: Round, model: StateSpaceModel, context: SearchContext) -> Round:
-    """Choose among refitted laws: the simplest at the place that is worth most, in its simplest form.
-
-    None where one that is worth as much is of another cause, nor a free function where no error rose since a fit.
+    """Choose among refitted laws: the simplest at the place that is worth most, in its simplest form. None where one
+    that is worth as much is of another cause, nor a free function where no error rose since a fit.
     """
     values = [case.removed for case in admissible]
     worths = _worths(admissible, values, model)
@@ -136,7 +134,6 @@ def _worths(laws: Sequence[_Law], values: Sequence[float], model: StateSpaceMode
 
 def _form(law: _Law, laws: Sequence[_Law], values: Sequence[float], model: StateSpaceModel) -> _Law:
     """Simplest among a law, the free functions that contain it and what it contains, that explains as much as the best.
-
     The parts left out of all are the same, so that they differ by what they explain: a bump is no ripple.
     """
     own = law.candidate.start
@@ -154,9 +151,7 @@ def other_cause(one: AbstractEffect, best: AbstractEffect, system: AbstractSyste
 
 
 def _fresh(law: AbstractEffect, fit: SmoothedFit) -> bool:
-    """True for a law that the model does not hold, or that takes the place of one; of laws of an earlier fit also for
-    a change of one, in the form that it has there.
-    """
+    """True for a law that is new or takes the place of one, and for a change of a law of an earlier fit in its form."""
     model, pairs = fit.model, list(zip(fit.model.effects, fit.hypothesis.evidence, strict=True))
     present = {key_of(effect) for effect, evidence in pairs if evidence is not None}
     place = replaced(law, model)
@@ -188,10 +183,11 @@ def _log(case: Trial, context: SearchContext) -> None:
     screened, step, after = (share_of(share, "the squared error", 1) for share in removed)
     name, bar = words(key_of(case.effect)), f"bar {case.screened.bar:.1%}"
     text = f"{name} {values}: {screened} by the linear screen, {step} along its step"
-    context.log(
-        f"  {text}; {bar}; not refitted" if case.refit is None else f"  refitted {text}, {after} after it; {bar}"
-    )
-    if case.refit is not None and (reason := case.rejection):
+    if case.refit is None:
+        context.log(f"  {text}; {bar}; not refitted")
+        return
+    context.log(f"  refitted {text}, {after} after it; {bar}")
+    if reason := case.rejection:
         context.log(f"  {name} {reason}")
 
 
@@ -202,9 +198,7 @@ def _removals(tried: Sequence[Trial]) -> tuple[tuple[Key, float], ...]:
 
 
 def _suspects(ranked: Sequence[Screened]) -> tuple[Suspect, ...]:
-    """Laws that remove more than chance in a round after which none was accepted: those near the best, and of these the
-    named ones first.
-    """
+    """Laws over chance after a round that accepted none: those near the best, of these the named ones first."""
     near = [s for s in ranked if s.listed >= NAMED * max(s.listed for s in ranked)]
     near.sort(key=lambda s: not s.candidate.start.named)
     over = [s for s in near if suspected(s.listed, s.floor, s.chance)]

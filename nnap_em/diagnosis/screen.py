@@ -1,8 +1,7 @@
 """The share of a squared error that each candidate removes, and the share that chance removes.
 
 Friction, parameters and accepted effects are nuisance: all data together project them out of errors and candidates, and
-only the strengths of a candidate are fitted without the parts left out.  Refitting friction and
-parameters on every fold diverges on chaotic recordings and rejects true effects.
+only strengths are fitted without the parts left out.  Refits on every fold diverge on chaotic recordings.
 """
 
 import itertools
@@ -67,13 +66,12 @@ class Screened(NamedTuple):
     share: Share
     band: int
     floor: float
-    """Smallest share that counts at that band."""
     chance: float
-    """Largest share of any placebo at that band that the parts left out confirm."""
+    """Smallest share that counts at that band, and largest of any placebo that the parts left out confirm."""
     survived: float = 1.0
-    """Norm of its columns that friction and parameters cannot give, over their norm [0 to 1]."""
     far: float = 0.0
-    """Distance of a linear law from none, in root mean square of the standard deviations of its prior."""
+    """Norm of its columns that friction and parameters cannot give, over their norm [0 to 1]; distance of a linear law
+    from none, in root mean square of the standard deviations of its prior."""
 
     @property
     def ratio(self) -> float:
@@ -193,11 +191,10 @@ def project(
 
 
 def shifted(linearised: Linearised, nuisance: int, rng: np.random.Generator) -> Linearised:
-    """Errors beside candidate columns of another time of their own sequence.
-
-    The columns behind the first `nuisance` ones are rolled over the moments of each sequence, by a quarter to three
-    quarters of them: they keep their size, their colour and their number, and lose their meaning.  What is rolled over
-    the end changes its sign, since a constant would keep its meaning.
+    """Errors beside candidate columns of another time of their own sequence. The columns behind the first `nuisance`
+    ones are rolled over the moments of each sequence, by a quarter to three quarters of them: they keep their size,
+    their colour and their number, and lose their meaning. What is rolled over the end changes its sign, since a
+    constant would keep its meaning.
     """
     columns = linearised.columns.copy()
     for weight, sequence in zip(linearised.weight, columns, strict=True):
@@ -238,7 +235,6 @@ class _Sums(NamedTuple):
 
 
 def _gone(c, score, gram) -> Float[np.ndarray, " candidate"]:
-    """Squared error that some coefficients remove."""
     return 2 * np.sum(c * score, axis=1) - np.einsum("mk,mkl,ml->m", c, gram, c)
 
 
@@ -253,10 +249,8 @@ def _sums(rows: Rows, places: Int[np.ndarray, "candidate probe"], ridge) -> _Sum
 
 
 def shares(rows: Rows, candidates: Sequence[Candidate], timed: Sequence[bool]) -> Shares:
-    """Shares of all candidates.
-
-    Every fold of motions is left out in turn and, unless a law is `timed`, every block of time; the smaller share
-    counts.  A fold whose error rises is compared with an average one, if that holds more.
+    """Shares of all candidates. Every fold of motions is left out in turn and, unless a law is `timed`, every block of
+    time; the smaller share counts. A fold whose error rises is compared with an average one, if that holds more.
     """
     cells, first = np.unique(rows.cell, return_index=True)
     square = np.add.reduceat(rows.error**2, first)
@@ -297,10 +291,7 @@ def _ridge(candidate: Candidate) -> Float[np.ndarray, " probe"]:
 def _bands(
     loss: MultiStep, fit: SmoothedFit, candidates: Sequence[Candidate], shifts: int
 ) -> tuple[tuple[Shares, ...], ...]:
-    """Shares of the candidates and of each placebo, by band.
-
-    The seed of the placebos is fixed, so that the same data give the same chance level.
-    """
+    """Shares of the candidates and of each placebo, by band; the same data give the same placebos."""
     blocks, out = blocks_of(candidates), []
     prior = friction_prior(fit.model, fit.m_step.weights(fit.model))
     for some, bands in zip(blocks, loss.linearise(fit, blocks), strict=True):
@@ -324,7 +315,6 @@ def screen(
     loss: MultiStep, fit: SmoothedFit, candidates: Sequence[Candidate], shifts: int = SHIFTS
 ) -> tuple[Screened, ...]:
     """Every candidate at the first band of horizons that shows it, else at that of the largest multiple of its bar.
-
     Bands are in the order of what they prove: errors soon after a start show more of what else a model lacks.
     """
     out, floor = [], MULTI_STEP / loss.remaining_share(fit)

@@ -31,7 +31,7 @@ from ..storage.log import Log, silent
 from .backward import backward
 from .context import SHORT, SearchContext, Stages, extend, quantised, smooth
 from .equations import search_equations
-from .hypothesis import Evidence, Hypothesis, covariances
+from .hypothesis import Evidence, Hypothesis, covariances, declared
 from .interventions import Intervention, interventions
 from .keys import Key, key_of, remainder_of, replaced, words
 from .losses import MultiStep
@@ -93,13 +93,12 @@ def _names(hypothesis: Hypothesis) -> frozenset[tuple[tuple[Key, Any], int]]:
 
 def search(context: SearchContext, *, release: Callable[[Identified, Dataset], Identified]) -> Diagnosis:
     """Search for what the declared model lacks, by multi-step errors; `release` ends the fit of the outcome."""
-    before = context.before
+    before, steps = context.before, cast(list[Step], [])
+    begun = declared(before), None
     try:  # steps of readings as noise: they spoil the noise that all else leans on
-        begun = (context.declared, None) if context.change else quantised(context, context.declared)
+        begun = begun if context.change else quantised(context, begun[0])
     except FAILURES as error:
         context.log(f"  with steps of readings as noise the fit fails ({error})")
-        begun = context.declared, None
-    steps: list[Step] = []
     hypothesis, state, stopped = _search(context, *begun, lengths_of(context), steps)
     outcome = before if state is None else before._replace(state=state, m_step=hypothesis.m_step)
     try:
@@ -123,10 +122,9 @@ def _determined(
         outcome = release(context.before._replace(state=state, m_step=hypothesis.m_step), context.data)
         model, found = outcome.model, hypothesis.evidence
         spreads = covariances(model, outcome.m_step, outcome.state.hessian)
-        sure = [
-            certainty(one.candidate, effect, cov) if one and one.candidate else math.inf
-            for one, effect, cov in zip(found, model.effects, spreads, strict=True)
-        ]
+        tested = [one.candidate if one else None for one in found]
+        every = zip(tested, model.effects, spreads, strict=True)
+        sure = [certainty(one, effect, cov) if one else math.inf for one, effect, cov in every]
         least = doubtful(sure, math.inf if context.white else len(context.data.t))
         if least is None:
             return hypothesis, outcome, steps
@@ -141,10 +139,9 @@ def _determined(
 
 
 def doubtful(sure: Sequence[float], recordings: int | float) -> int | None:
-    """Place of the law of the least Wald statistic, where that of its stated values shows no law.
-
-    The search counts rows by their likelihood, which is surer than recordings agree; of few, the standard deviation is
-    hardly known, and chance is that of Student's t [Cameron & Miller 2015, J. Human Resources 50(2), for clusters].
+    """Place of the law of the least Wald statistic, where that of its stated values shows no law. The search counts
+    rows by their likelihood, which is surer than recordings agree; of few, the standard deviation is hardly known, and
+    chance is that of Student's t [Cameron & Miller 2015, J. Human Resources 50(2), for clusters].
     """
     least = int(np.argmin(sure))
     chance = stats.t.isf(stats.norm.sf(DETERMINED), max(recordings - 1, 1))
@@ -152,11 +149,10 @@ def doubtful(sure: Sequence[float], recordings: int | float) -> int | None:
 
 
 def lengths_of(context: SearchContext) -> list[int]:
-    """Rows of the first rounds: all, or if most sequences diverge before, as many as most keep.
-
-    Where a joint is hidden and readings are white, the two shortest horizons of the fit, and one in the middle: over
-    the whole length a fit takes a strong effect for process noise. On a simulated arm a spring explains 0.38 of the
-    multi-step error over 0.6 s, less than 0.09 over 5 s. On real arms short horizons named six of 13 laws wrong.
+    """Rows of the first rounds: all, or if most sequences diverge before, as many as most keep. Where a joint is hidden
+    and readings are white, the two shortest horizons of the fit, and one in the middle: over the whole length a fit
+    takes a strong effect for process noise. On a simulated arm a spring explains 0.38 of the multi-step error over 0.6
+    s, less than 0.09 over 5 s. On real arms short horizons named six of 13 laws wrong.
     """
     longest = context.longest
     if context.white and context.before.model.hides:
@@ -179,10 +175,9 @@ def _search(
     context: SearchContext, hypothesis: Hypothesis, state: EMState | None, lengths: list[int], steps: list[Step]
 ) -> tuple[Hypothesis, EMState | None, str | None]:
     """Forward selection and backward elimination, until neither changes anything or the time is up: the hypothesis, its
-    fit over the whole length, and the numerical failure that stopped it, empty where the time was up.
-
-    The rounds use `lengths` rows in turn, then, and after the first law at once, all.  A law that was accepted
-    in time is fitted over the whole length, however long that takes.
+    fit over the whole length, and the numerical failure that stopped it, empty where the time was up. The rounds use
+    `lengths` rows in turn, then, and after the first law at once, all. A law that was accepted in time is fitted over
+    the whole length, however long that takes.
     """
     searched: set[frozenset] = set()
     longest = context.longest
@@ -260,9 +255,9 @@ def diagnose(
     data = Dataset(*map(jax.device_put, stepped(sequences_of(data, rig))))
     stages: Stages = {}
 
-    declared = begin(rig, data, key=key).model
-    white = white_readings(data, declared)
-    held, hold = held_in(rig, declared, white)
+    first = begin(rig, data, key=key).model
+    white = white_readings(data, first)
+    held, hold = held_in(rig, first, white)
 
     def watch(state: EMState, rows: int, used: Bool[np.ndarray, " seq"]) -> None:
         stages[rows] = state, used
@@ -345,10 +340,9 @@ def released(rule: ScoringMStep) -> ScoringMStep:
 
 
 def unbranched(bank: StartBank) -> GaussianSmoother:
-    """Smoother of the search: one Gaussian.
-
-    The likelier branch of a hidden angle is that of the model, and a model that lacks an effect chooses wrongly: on a
-    real double pendulum with a planted bump its fit became likelier so, and the bump was no longer seen.
+    """Smoother of the search: one Gaussian. The likelier branch of a hidden angle is that of the model, and a model
+    that lacks an effect chooses wrongly: on a real double pendulum with a planted bump its fit became likelier so, and
+    the bump was no longer seen.
     """
     return CubatureSmoother(bank, branching=False)
 

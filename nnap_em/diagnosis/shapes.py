@@ -9,10 +9,9 @@ from scipy.optimize import least_squares
 from ..effects.base import Curve
 from .forms import Description, Form, Quantity, View, forms
 
-EXPLAINS = 0.85
-"""Least share of the variance, adjusted for free numbers, that a named shape explains: a sine has 81 % of a square."""
-INDISTINGUISHABLE = 2.0
-"""Largest difference in the Schwarz criterion that is no evidence, so the simpler shape wins [Kass & Raftery 1995]."""
+EXPLAINS, INDISTINGUISHABLE = 0.85, 2.0
+"""Least share of the variance, adjusted for free numbers, that a named shape explains: a sine has 81 % of a square; and
+largest difference in the Schwarz criterion that is no evidence, so the simpler shape wins [Kass & Raftery 1995]."""
 
 
 class Shape(NamedTuple):
@@ -55,7 +54,6 @@ class _Seen(NamedTuple):
 
 def shape(curve: Curve) -> Shape:
     """The simplest shape that explains a learned curve, with numbers and units; a smooth function where none does.
-
     Every shape is seen through the basis of the curve, so that a sharp step and the transition that the basis makes of
     it are one. Places and widths from a grid, polished, sizes by linear least squares [Golub & Pereyra 1973]; of the
     shapes the first, in the order of simplicity, whose Schwarz criterion is not clearly above the lowest.

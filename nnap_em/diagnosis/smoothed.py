@@ -22,12 +22,10 @@ from .hypothesis import Hypothesis, declared
 
 
 class SmoothedFit(NamedTuple):
-    """A fitted hypothesis and its smoothed paths, over all rows or their beginning."""
+    """A fitted hypothesis beside the declared one, and its smoothed paths, over all rows or their beginning."""
 
     declared: Hypothesis
-    """The declared model."""
     hypothesis: Hypothesis
-    """The same with the effects that were accepted."""
     path: Gaussian
     data: Dataset
     used: Bool[np.ndarray, " seq"]

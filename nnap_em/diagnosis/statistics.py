@@ -15,10 +15,9 @@ from jaxtyping import Bool, Float
 
 from .residual import Names, Residual
 
-LAGS = 20
-"""Samples over which innovations are tested for whiteness."""
-FAILS = 0.05
-"""Corrected p-value below which a test counts as failed."""
+LAGS, FAILS, SMALL_MISFIT = 20, 0.05, 0.1
+"""Samples over which innovations are tested for whiteness; corrected p-value below which a test counts as failed; size
+below which a failed test is called small."""
 
 
 def holm(p: Sequence[float]) -> Float[np.ndarray, " test"]:
@@ -56,9 +55,8 @@ def autocorrelation(
 
 
 def spread(e: Float[np.ndarray, "seq time"]) -> tuple[float, float, float]:
-    """Normalised innovation squared: its mean (1 if the stated uncertainty is right), p-value, std minus 1.
-
-    N times the mean is chi^2_N.  [Bar-Shalom, Li & Kirubarajan 2001, section 5.4.2]
+    """Normalised innovation squared: its mean (1 if the stated uncertainty is right), p-value, std minus 1. N times the
+    mean is chi^2_N. [Bar-Shalom, Li & Kirubarajan 2001, section 5.4.2]
     """
     x = e[np.isfinite(e)]
     mean = float(np.mean(x**2))
@@ -67,11 +65,10 @@ def spread(e: Float[np.ndarray, "seq time"]) -> tuple[float, float, float]:
 
 
 def dependence(e: Float[np.ndarray, "seq time"], cause: Float[np.ndarray, "seq time"]) -> tuple[float, float, float]:
-    """Correlation of innovations with a cause known before them: Student's t, p-value, correlation.
-
-    The sums of their product over sequences, cut in parts of some 50 readings, are of mean 0, as good as independent,
-    and of unlike variance; the t-test of them is conservative then, and holds where errors follow each other over
-    some samples.  [Ibragimov & Mueller 2010, J. Bus. Econ. Stat. 28, 453]
+    """Correlation of innovations with a cause known before them: Student's t, p-value, correlation. The sums of their
+    product over sequences, cut in parts of some 50 readings, are of mean 0, as good as independent, and of unlike
+    variance; the t-test of them is conservative then, and holds where errors follow each other over some samples.
+    [Ibragimov & Mueller 2010, J. Bus. Econ. Stat. 28, 453]
     """
     seen = np.isfinite(e) & np.isfinite(cause)
     x, g = (np.where(seen, a - np.mean(a, where=seen), 0.0) for a in (e, cause))
@@ -102,8 +99,7 @@ class Test(NamedTuple):
     p_value: float
     """Corrected for the number of tests [Holm 1979]."""
     size: float
-    """Distance from a right model, whatever the number of samples: largest autocorrelation; standard deviation minus 1;
-    correlation."""
+    """Distance from a right model: largest autocorrelation; standard deviation minus 1; correlation."""
     meaning: str
     """The result in one sentence."""
     slight: bool
@@ -131,8 +127,6 @@ KINDS = {  # of each test what is said where it passes, and where it fails; a co
     "spread": ("are as large as the model expects", "are {times:.3g} times as large as the model expects"),
     "correlation": ("show no link with {cause}", "change with {cause} (correlation {size:.2g})"),
 }
-SMALL_MISFIT = 0.1
-"""Size below which a failed test is called small."""
 
 
 def tests(residual: Residual, names: Names) -> list[Test]:

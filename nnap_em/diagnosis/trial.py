@@ -26,13 +26,11 @@ class Trial(NamedTuple):
 
     screened: Screened
     after: Hypothesis
-    """The model with it."""
     removed: float
     """Share of the squared error that it removes, at the horizons by which its band is judged."""
     certainty: float
-    """Wald statistic of its strengths, jointly [standard deviations]."""
     amplitude: float
-    """The same of its reported amplitude alone; infinite for a law that reports none."""
+    """Wald statistics [standard deviations] of its strengths, jointly, and of its reported amplitude, inf without."""
     foreseen: float = np.nan
     """Share that the step of the screen removes, before any pass."""
     refit: Refit | None = None
@@ -89,7 +87,6 @@ def leader(begun: Iterable[tuple[Trial, Refit]]) -> tuple[Trial, Refit]:
 def with_candidate(forms: Sequence[Screened], null: Null, fit: SmoothedFit, loss: MultiStep) -> Trial:
     """A law in the model, or in the place of the law that it is another form of, refitted from the one of its `forms`
     whose step removes most and is physical: on the linear screen a friction of three periods may explain what five do.
-
     Not refitted where the nonlinear error hardly falls along that step (`foreseen`).
     """
     hypothesis = fit.hypothesis
@@ -110,17 +107,13 @@ def with_candidate(forms: Sequence[Screened], null: Null, fit: SmoothedFit, loss
     trial = trial._replace(after=trial.after.refitted(end.model), refit=end)
     effect, cov = trial.effect, covariances(trial.after.model, trial.after.m_step, end.hessian)[-1]
     reported = estimates(effect, cov, trial.after.model.system).get("amplitude")
-    return trial._replace(
-        removed=1 - loss.ratio(null.end, end, fit, form.band),
-        certainty=certainty(form.candidate, effect, cov),
-        amplitude=reported.value / reported.std if reported and reported.std > 0 else np.inf,
-    )
+    amplitude = reported.value / reported.std if reported and reported.std > 0 else np.inf
+    sure, removed = certainty(form.candidate, effect, cov), 1 - loss.ratio(null.end, end, fit, form.band)
+    return trial._replace(removed=removed, certainty=sure, amplitude=amplitude)
 
 
 def explained(case: Trial, context: SearchContext) -> float:
-    """Share of the squared error that a law as it is fitted removes from the recordings of the fit before the search,
-    with the friction and the numbers of that fit; -inf where there is none, or its recordings are not at hand.
-    """
+    """Share of the squared error on the recordings of an earlier fit that a law removes; -inf without them."""
     if (fit := context.origin) is None:
         return -np.inf
     full, loss = fit.hypothesis.plus(case.effect, case.candidate), context.loss
@@ -130,9 +123,8 @@ def explained(case: Trial, context: SearchContext) -> float:
 
 
 def certainty(candidate: Candidate, effect: AbstractEffect, cov: Float[np.ndarray, "param param"]) -> float:
-    """Wald statistic of the strengths of an effect, jointly, in standard deviations [Wald 1943].
-
-    Half its square is the log-likelihood that would be lost without the effect, to second order.
+    """Wald statistic of the strengths of an effect, jointly, in standard deviations [Wald 1943]. Half its square is the
+    log-likelihood that would be lost without the effect, to second order.
     """
     none = np.asarray(flat(candidate.start))
     strong = np.any([np.asarray(flat(probe)) != none for probe in candidate.probes], axis=0)

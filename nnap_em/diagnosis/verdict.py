@@ -27,10 +27,9 @@ FAR = 3.0
 SURVIVES = 0.05
 """Smallest share of a law's columns that friction and parameters cannot give: on a slide under control that lacks a
 force 2 % of a false scale of its sensor, and 10 to 95 % of all other laws."""
-CERTAIN = 5.0
-"""Wald statistic [standard deviations] from which on an effect differs from none: 12.5 nat of log-likelihood."""
-DETERMINED = 2.0
-"""The same for its amplitude alone: amplitude and phase may cancel in a fit, so that neither is known."""
+CERTAIN, DETERMINED = 5.0, 2.0
+"""Wald statistics [standard deviations] from which on an effect differs from none, 12.5 nat of log-likelihood, and its
+amplitude alone: amplitude and phase may cancel in a fit, so that neither is known."""
 EQUIVALENT = 0.9
 """Share of the best from which on a law explains the same: a simpler law is then preferred to one that contains it,
 refits decide between others, and between laws of different causes the question stays open."""
@@ -39,19 +38,14 @@ EQUIVALENT_NATS = 5.0
 FORESEEN = 1 / 3
 """Multiple of what a refit must remove by which the error must fall along the step of the screen, or none is made."""
 KEEP = 0.6
-"""Multiple of the floor that a refit must remove, and that must be lost without an effect for the effect to stay: a
-refit, which is not linear, differs from the screen by less than the rest."""
+"""Multiple of the floor that a refit must remove, and that must be lost without an effect for the effect to stay."""
 PAIR = 0.5
 """Prior odds of a pair of laws of equations to a single one: 120 pairs of the best sixteen laws are tried."""
-SUSPECT_SHARE = 0.08
-"""Share from which on a law of equations is listed as a suspect."""
-SUSPECT = 0.5
-"""Multiple of the floor from which on a law is listed as a suspect: on two real rigs as recorded the best of 600
-candidates removed 0.02 and 0.07 of the multi-step error."""
-
+SUSPECT, SUSPECT_SHARE = 0.5, 0.08
+"""Multiple of the floor from which on a law is listed as a suspect, on two real rigs as recorded the best of 600
+candidates removed 0.02 and 0.07 of the multi-step error; share from which on a law of equations is."""
 HELD = 0.2
-"""Standard deviation of declared numbers in a search by multi-step errors over the declared one: likelihood counts rows
-that follow each other as independent, and would bend the numbers by many of them to stand for what is missing."""
+"""Standard deviation of declared numbers in a search over the declared one: else they bend to what is missing."""
 FOLLOWED = 0.5
 """Share of the sequences that the first round follows: over the whole length, or as many rows as so many keep."""
 REPEATS = 0.2
@@ -59,12 +53,9 @@ REPEATS = 0.2
 differ by up to 0.13, others by 0.25 and more."""
 RISEN = 0.01
 """Chance of errors as large as those of new recordings, by their ranks, below which something changed since a fit."""
-COARSE = 0.1
-"""Variance of rounding to the steps of a reading, over that of its noise, from which on steps are an effect."""
-FINEST = 0.25
-"""Smallest share of an estimated variance of a reading that is noise beside the rounding in it."""
-
-
+COARSE, FINEST = 0.1, 0.25
+"""Variance of rounding to the steps of a reading, over that of its noise, from which on steps are an effect; smallest
+share of an estimated variance that is noise beside the rounding in it."""
 MULTI_STEP = 0.15
 """Smallest share that counts, whatever chance can do: aliases of what their models lack remove up to 0.14 on three real
 rigs as recorded, and below it an effect that is not in the catalogue looks like some law that is."""
@@ -87,18 +78,16 @@ class Share(NamedTuple):
 
 
 def sensible(multiple: float, far: float, survived: float, *, linear: bool) -> bool:
-    """True for a law that a fit may reach and that the nuisance cannot stand for.
-
-    `multiple` is the fitted multiple of its probe, `far` the distance of a linear law from none in standard deviations
-    of its prior, `survived` the share of its columns that friction and parameters cannot give.
+    """True for a law that a fit may reach and that the nuisance cannot stand for. `multiple` is the fitted multiple of
+    its probe, `far` the distance of a linear law from none in standard deviations of its prior, `survived` the share of
+    its columns that friction and parameters cannot give.
     """
     return (linear or PROBE[0] < multiple < PROBE[1]) and far < FAR and survived >= SURVIVES
 
 
 def agreed(folds: Sequence[float], floor: float, *, responds: bool = False) -> bool:
-    """True where the error falls on most parts and rises on none by much.
-
-    A free function of an input `responds` to any disturbance under feedback, and has to remove the floor on every part.
+    """True where the error falls on most parts and rises on none by much. A free function of an input `responds` to any
+    disturbance under feedback, and has to remove the floor on every part.
     """
     if responds:
         return min(folds) >= floor
@@ -121,9 +110,7 @@ def even(values: Sequence[float]) -> list[int]:
 
 
 def lead(own: float, its: float) -> float:
-    """Distance by which a law in the place of another explains more than that, in units of that within which both
-    explain the same: beyond one it is clearly better, below minus one clearly worse.
-    """
+    """Lead of a law in the place of another: beyond 1 clearly better, below -1 clearly worse, else the same."""
     return (its - own) / max((1 - EQUIVALENT) * max(own, its), 1e-12)
 
 
@@ -141,21 +128,13 @@ BEFORE = "explains the recordings of the fit as well, of which it removes {}: it
 
 
 def veto(
-    *,
-    possible: bool,
-    certainty: float,
-    amplitude: float,
-    removed: float,
-    floor: float,
-    complexity: int,
+    *, possible: bool, certainty: float, amplitude: float, removed: float, floor: float, complexity: int,
     before: float = -math.inf,
-) -> str | None:
-    """Reason against an effect after its refit, None where there is none.
-
-    `certainty` is the Wald statistic of its strengths, `amplitude` that of its reported amplitude (infinite without
-    one), `removed` the share of the squared error that goes with it, `floor` the smallest share that counts,
-    `complexity` that of the law, `before` the share that it removes from the recordings of an earlier fit: a law that
-    counts there as well is missing, and no change.
+) -> str | None:  # fmt: skip
+    """Reason against an effect after its refit, None where there is none. `certainty` is the Wald statistic of its
+    strengths, `amplitude` that of its reported amplitude (infinite without one), `removed` the share of the squared
+    error that goes with it, `floor` the smallest share that counts, `complexity` that of the law, `before` the share
+    that it removes from the recordings of an earlier fit: a law that counts there as well is missing, and no change.
     """
     least = required(floor, complexity)
     if not possible:
@@ -175,9 +154,8 @@ def needed(share: float, floor: float) -> bool:
 
 
 def foreseen(share: float, floor: float, complexity: int, *, hidden: bool) -> bool:
-    """True where the step of the screen removes a share of the squared error that makes a refit worth its time.
-
-    A motion that is `hidden` was inferred without the law, and need not follow it.
+    """True where the step of the screen removes a share of the squared error that makes a refit worth its time. A
+    motion that is `hidden` was inferred without the law, and need not follow it.
     """
     return hidden or needed(share, FORESEEN * required(floor, complexity))
 

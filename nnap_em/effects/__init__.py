@@ -20,15 +20,6 @@ parts: tuple[type, ...] = (Axis, InputAxis)
 """Parts of effects besides numbers."""
 
 __all__ = [
-    "AbstractEffect",
-    "Candidate",
-    "JointEffect",
-    "OperatingPoint",
-    "SearchScales",
-    "SensorEffect",
-    "catalogue",
-    "fields",
-    "flat",
-    "free_form",
-    "parts",
+    "AbstractEffect", "Candidate", "JointEffect", "OperatingPoint", "SearchScales", "SensorEffect", "catalogue",
+    "fields", "flat", "free_form", "parts",
 ]  # fmt: skip

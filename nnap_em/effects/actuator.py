@@ -17,10 +17,8 @@ class DriveEffect(JointEffect):
     joint: int | None = eqx.field(static=True, default=None, kw_only=True)
 
     def units_on(self, system):
-        return {
-            name: system.unit(self.channel) if unit == "N m" and self.channel else unit
-            for name, unit in super().units_on(system).items()
-        }
+        of = {"N m": system.unit(self.channel)} if self.channel else {}
+        return {name: of.get(unit, unit) for name, unit in super().units_on(system).items()}
 
 
 class InputEffect(DriveEffect):
@@ -78,9 +76,7 @@ class Saturation(InputEffect):
 
     name: ClassVar[str] = "saturation"
     meaning: ClassVar[str] = "The drive cannot deliver more than a limit."
-    confirm: ClassVar[str] = (
-        "Block the joint and raise the command until the torque stays the same; look at the drive's current limit."
-    )
+    confirm: ClassVar[str] = "Block the joint and raise the command until the torque stays; look at the current limit."
     units: ClassVar[dict[str, str]] = {"limit": "N m"}
     above_zero: ClassVar[str] = "limit"
     linear: ClassVar[bool] = False

@@ -22,9 +22,8 @@ class OperatingPoint(NamedTuple):
 
     system: Any
     q: Float[Array, " dof"]
-    """Coordinates; of equations all states."""
     v: Float[Array, " rate"]
-    """Rates; of equations none."""
+    """Coordinates and rates; of equations all states, and none."""
     drive: Float[Array, " port"]
     """Generalised force of the inputs [N m]."""
     time: Scalar
@@ -57,9 +56,8 @@ class SearchScales(NamedTuple):
     dt: float
     """Sample interval, or what counts as one where sizes are grown from it [s]."""
     duration: tuple[float, float]
-    """First and last time on the clock [s]."""
     ending: float
-    """Last time of the whole recording, of which a part is looked at [s]."""
+    """First and last time on the clock, and last one of the whole recording, of which a part is looked at [s]."""
     session: bool
     """True where the clock runs on over all sequences."""
     learned: bool
@@ -365,9 +363,8 @@ def pair(make: Callable[..., AbstractEffect], probe: float, spread: float, *inne
 
 
 def contact(deep: Scalar, rate: Scalar, stiffness: Scalar, damping: Scalar, edge: float) -> Scalar:
-    """Force of a spring and a damper that are pressed in, on either side, and never pull.
-
-    The damper comes on within `edge`, so that a fit can move the place of contact.
+    """Force of a spring and a damper that are pressed in, on either side, and never pull. The damper comes on within
+    `edge`, so that a fit can move the place of contact.
     """
     push = stiffness * deep + damping * jnp.tanh(jnp.abs(deep) / edge) * rate
     return jnp.where(deep > 0, jnp.maximum(push, 0.0), jnp.minimum(push, 0.0))

@@ -45,11 +45,8 @@ class Payload(Variation):
     confirm: ClassVar[str] = "Weigh the links, with everything that is mounted on them."
     units: ClassVar[dict[str, str]] = {"mass": "kg", "centre_x": "m", "centre_y": "m", "centre_z": "m"}
     words: ClassVar[dict[str, str]] = {
-        "mass": "added mass",
-        "centre_x": "its centre along x of the body",
-        "centre_y": "its centre along y",
-        "centre_z": "its centre along z",
-    }
+        "mass": "added mass", **{f"centre_{axis}": f"its centre along {axis} of the body" for axis in "xyz"}
+    }  # fmt: skip
     moment: Float[Array, "3"] | None = None
     """First moment about the point [kg m]; None: the mass is at the tip."""
     point: tuple[float, float, float] = eqx.field(static=True, default=(0.0, 0.0, 0.0))
@@ -69,17 +66,13 @@ class Payload(Variation):
 
     def physics(self, system, time):
         if self.moment is None:
-            return system.vary(self.name, self.joint, self.amount)
+            return super().physics(system, time)
         return system.loaded(self.joint, self.amount, self.moment)
 
 
 def _anywhere(kind: type[Payload], joint: int, spot) -> Candidate:
     """A load of unknown mass and centre: four strengths."""
-
-    def make(mass: float, moment: np.ndarray) -> Payload:
-        return kind(a(mass), jnp.asarray(moment, float), spot.point, joint=joint)
-
-    size = spot.mass * spot.length
+    size, make = spot.mass * spot.length, lambda mass, moment: kind(a(mass), a(moment), spot.point, joint=joint)
     probes = (make(0.05 * spot.mass, np.zeros(3)), *(make(0.0, 0.05 * size * row) for row in np.eye(3)))
     return Candidate(make(0.0, np.zeros(3)), probes, make(spot.mass, np.full(3, size)))
 

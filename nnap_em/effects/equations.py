@@ -6,6 +6,7 @@ Each is a `Flow`: one formula for all of them, so that a search compiles one pro
 import itertools
 import math
 from collections.abc import Sequence
+from functools import partial
 from typing import Any, ClassVar, cast
 
 import equinox as eqx
@@ -14,13 +15,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .base import AbstractEffect, Candidate, Scalar, SearchScales, SensorEffect, a, known
+from .base import AbstractEffect, Candidate, Scalar, SearchScales, SensorEffect, a, known, one
 
 STRONG = 5.0
 """Prior standard deviation of a strength: multiple of that which moves a state by its typical rate over the range of
 the signal."""
-
-
 FORMS = (
     "", " in proportion to {0}", " in proportion to {0} - {1}", " in proportion to {0} {1}", " with the square of {0}",
     "", " of {1}",
@@ -181,9 +180,7 @@ class LinearFlow(PortEffect):
     """strength p: a leak where p is the state itself, else a coupling."""
 
     name: ClassVar[str] = "linear_flow"
-    meaning: ClassVar[str] = (
-        "A state gains or loses in proportion to a signal: a leak where it is its own, else a coupling."
-    )
+    meaning: ClassVar[str] = "A state gains or loses in proportion to a signal: a leak where it is its own."
     confirm: ClassVar[str] = "Hold all else still, change this signal alone, and watch the rate of the state."
     kind: ClassVar[int] = 1
 
@@ -274,13 +271,8 @@ class Bend(SensorEffect):
 
     @classmethod
     def candidates(cls, around):
-        def make(bend: float, true: float, name: str):
-            low, high = around.ends[name]
-            return cls(a(bend), a(low + true * (high - low)), high - low, channel=name)
-
-        at = [(make(0.0, 0.0, name), make(0.02, 0.0, name)) for name in around.ends]
-        wide = [eqx.tree_at(lambda e: (e.bend, e.true), one, (a(0.5), a(one.range))) for one, _ in at]
-        return [Candidate(start, (probe,), std) for (start, probe), std in zip(at, wide, strict=True)]
+        ends = [(low, high - low, name) for name, (low, high) in around.ends.items()]
+        return [one(partial(cls, range=n, channel=name), 0.0, 0.02, 0.5, (low, n)) for low, n, name in ends]
 
     def reading(self, value, past):
         return value + self.bend * (value - self.true) ** 2 / self.range
@@ -302,7 +294,6 @@ def _grid(values: Float[Array, " axis"], low: Any, high: Any) -> Float[Array, " 
 
 @jax.custom_jvp
 def _function(weights: Float[Array, " node"], values: Float[Array, " axis"], low: Any, high: Any) -> Scalar:
-    """Sum of weighted basis functions."""
     return weights @ _grid(values, low, high)
 
 

@@ -102,9 +102,8 @@ class LoadFriction(JointEffect):
     log_velocity: Scalar | None = None
     """[log rad/s]"""
     square_motor: Scalar | None = None
-    """Coefficient of the motor's torque where the load drives [1/(N m)]."""
     square_load: Scalar | None = None
-    """Coefficient of the load's torque where the motor drives [1/(N m)]."""
+    """Coefficients of the torque of the motor where the load drives, and the reverse [1/(N m)]."""
     whole: bool = eqx.field(static=True, default=False, kw_only=True)
     """True where motor and load share one coefficient unless each has its own."""
     names: tuple[str, str] = eqx.field(static=True, kw_only=True)
@@ -131,8 +130,8 @@ class LoadFriction(JointEffect):
         return [_grown(self, squared, 1 / float(around.torque[self.joint - 1]))]
 
     def _with_stribeck(self, velocity: float) -> "LoadFriction":
-        extended = replace(self, stribeck=a(0.0), log_velocity=a(math.log(velocity)))
-        return extended if self.load is None else replace(extended, load_stribeck=a(0.0))
+        both = None if self.load is None else a(0.0)
+        return replace(self, stribeck=a(0.0), log_velocity=a(math.log(velocity)), load_stribeck=both)
 
     def _with_load(self) -> "LoadFriction":
         share = 1.0 if self.whole else 0.0
@@ -149,10 +148,9 @@ class LoadFriction(JointEffect):
 
     def _shares(self) -> tuple[Scalar | None, ...]:
         """Coefficients of motor and load, steady and at rest; None: no such number."""
-        shares: list[Scalar | None] = []
-        for motor, load in ((self.mu, self.load), (self.stribeck, self.load_stribeck)):
-            shares += [motor, motor if load is None and self.whole else load]
-        return tuple(shares)
+        whole = lambda motor, load: motor if load is None and self.whole else load  # noqa: E731
+        mu, stribeck = self.mu, self.stribeck
+        return mu, whole(mu, self.load), stribeck, whole(stribeck, self.load_stribeck)
 
     def is_physical(self):
         return float(self.mu) + (0.0 if self.load is None else float(self.load)) > 0
@@ -170,9 +168,8 @@ class LoadFriction(JointEffect):
             return total
         stribeck = _through(motor, load, self.stribeck, self.load_stribeck, whole=self.whole)
         if self.square_motor is not None and self.square_load is not None:
-            driving = jnp.where(
-                jnp.abs(motor) > jnp.abs(load), self.square_load * load**2, self.square_motor * motor**2
-            )
+            squares = self.square_load * load**2, self.square_motor * motor**2
+            driving = jnp.where(jnp.abs(motor) > jnp.abs(load), *squares)
             stribeck = stribeck + jnp.where(motor * load > 0, driving, 0.0)
         return total + stribeck * jnp.exp(-((rate * jnp.exp(-self.log_velocity)) ** 2))
 

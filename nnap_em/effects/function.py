@@ -38,7 +38,6 @@ class AbstractAxis(eqx.Module):
         """Unit of the argument."""
 
     def signals(self, system: AbstractSystem) -> tuple[str, ...]:
-        """Signal that is its argument."""
         return self.names
 
     def acts(self, system: AbstractSystem) -> int | None:
@@ -46,11 +45,9 @@ class AbstractAxis(eqx.Module):
         return None
 
     def of_states(self, system: AbstractSystem) -> set[str]:
-        """The states that it reads."""
         return set(self.names) & {*system.coordinates, *system.rates}
 
     def centres(self) -> Float[Array, " basis"]:
-        """Places of the basis functions."""
         return jnp.linspace(self.low, self.high, self.count, endpoint=not self.turns)
 
     def basis(self, value: Scalar) -> Float[Array, " basis"]:
@@ -125,11 +122,8 @@ class UnknownFunction(JointEffect):
         places = [(j, grid) for j in around.joints for grid in grids]
         rates = [] if around.moved is None else [(j, system.rates[j - 1]) for j in around.joints]
         friction = [_function(j, (axes[rate,](20),), around) for j, rate in rates if (rate,) in axes]
-        return friction + [
-            _function(j, grid, around)
-            for j, grid in places
-            if all(axis.acts(system) in (None, j) and axis.of_states(system) <= near[j] for axis in grid)
-        ]
+        fits = lambda axis, j: axis.acts(system) in (None, j) and axis.of_states(system) <= near[j]  # noqa: E731
+        return friction + [_function(j, grid, around) for j, grid in places if all(fits(axis, j) for axis in grid)]
 
     def values(self):
         return {}
@@ -225,9 +219,7 @@ class PeriodicForce(JointEffect):
 
     name: ClassVar[str] = "periodic_force"
     reported_as: ClassVar[str] = "unknown_function"
-    confirm: ClassVar[str] = (
-        "Log the motion at rest with the drives off: what pushes in time with the machine beside it?"
-    )
+    confirm: ClassVar[str] = "Log the motion at rest with the drives off: what beside the machine pushes in time?"
     units: ClassVar[dict[str, str]] = {"size": "N m", "frequency": "Hz"}
     arguments: ClassVar[tuple[str, ...]] = ("time",)
     sine: Float[Array, " harmonic"]
@@ -246,7 +238,6 @@ class PeriodicForce(JointEffect):
         return [_at(j, f, 1, around) for j in around.joints for f in tried if f * span >= 1.0]  # one period at least
 
     def values(self):
-        """Root mean square of the force, and how often it comes."""
         return {"size": jnp.sqrt(0.5 * jnp.sum(self.sine**2 + self.cosine**2) + 1e-30), "frequency": self.frequency}
 
     def inputs_named(self):
@@ -263,7 +254,6 @@ class PeriodicForce(JointEffect):
         return jnp.sin(angle) @ self.sine + jnp.cos(angle) @ self.cosine
 
     def curve(self, cov, system):
-        """Two periods of the waveform, its mean taken away."""
         x, count = np.linspace(0.0, 2.0, 121), self.harmonics
         angle = 2 * np.pi * x[:, None] * np.arange(1, count + 1)
         basis = np.concatenate([np.sin(angle), np.cos(angle)], axis=1)

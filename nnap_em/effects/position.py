@@ -19,20 +19,16 @@ class TorsionalSpring(JointEffect):
 
     name: ClassVar[str] = "torsional_spring"
     meaning: ClassVar[str] = "A joint is pulled back to a rest position, as by a cable or a spring."
-    confirm: ClassVar[str] = (
-        "Move the unpowered joint by hand and look for a force that pulls back to one angle: a cable, a hose, a spring."
-    )
+    confirm: ClassVar[str] = "Move the unpowered joint by hand: does a cable, hose or spring pull back to one angle?"
     units: ClassVar[dict[str, str]] = {"k": "N m/rad", "theta0": "rad"}
     words: ClassVar[dict[str, str]] = {"k": "stiffness", "theta0": "rest position"}
     arguments: ClassVar[tuple[str, ...]] = ("position",)
     slope: Scalar
-    """Stiffness at zero [N m/rad]."""
     moment: Scalar
-    """Torque at zero [N m]."""
+    """Stiffness [N m/rad] and torque [N m] at zero."""
     square: Scalar
-    """[N m/rad^2]"""
     cube: Scalar
-    """[N m/rad^3]"""
+    """[N m/rad^2] and [N m/rad^3]."""
     reach: Scalar = known(default=1e3)
     """Angle [rad] beyond which it was never seen: from there on it is straight, and never pushes outward more."""
 
@@ -151,9 +147,8 @@ class HardStop(JointEffect):
     upper: Scalar
     lower: Scalar
     stiffness: Scalar
-    """Log of the contact stiffness [N m/rad]."""
     damping: Scalar
-    """Log of the contact damping [N m s/rad]."""
+    """Logs of the stiffness [N m/rad] and of the damping [N m s/rad] of the contact."""
     reach: Scalar = known()
     """Range of the joint on the paths; stops that nearly touch each other are a spring in disguise."""
     soft: Scalar = known()
@@ -196,9 +191,8 @@ class EddyBrake(JointEffect):
     words: ClassVar[dict[str, str]] = {"c": "largest damping", "center": "strongest at"}
     arguments: ClassVar[tuple[str, ...]] = ("position", "rate")
     even: Scalar
-    """c cos(2 center)."""
     odd: Scalar
-    """c sin(2 center)."""
+    """c cos(2 center) and c sin(2 center)."""
 
     @classmethod
     def candidates(cls, around):

@@ -16,9 +16,8 @@ class Transmission(JointEffect):
     memory: ClassVar[int] = 2
     linear: ClassVar[bool] = False
     log_inertia: eqx.AbstractVar[Scalar]
-    """Inertia of the motor [log kg m^2]."""
     log_damping: eqx.AbstractVar[Scalar]
-    """[log N m s/rad]"""
+    """Inertia of the motor [log kg m^2] and damping [log N m s/rad]."""
 
     @abstractmethod
     def torque(self, twist: Scalar, rate: Scalar) -> Scalar:
@@ -62,9 +61,8 @@ class JointFlexibility(Transmission):
         for j, size in around.driven:
             inertia = MOTOR * around.inertia(j)
             for k in (2.0, 6.0, 20.0):
-                stiff, soft = (
-                    cls.of(*np.log([s * size, inertia, 0.2 * np.sqrt(s * size * inertia)]), joint=j) for s in (1e3, k)
-                )
+                springs = (s * size for s in (1e3, k))
+                stiff, soft = (cls.of(*np.log([s, inertia, 0.2 * np.sqrt(s * inertia)]), joint=j) for s in springs)
                 out.append(Candidate(stiff, (soft,), cls.of(1.0, 0.7, 1.0, joint=j)))
         return out
 

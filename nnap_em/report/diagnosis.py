@@ -88,7 +88,7 @@ def write_diagnosis(
         "noise": {name: noise(fitted) for name, fitted in both.items()},
         "rounds": [_round(step, diagnosis.before.rig.dt) for step in diagnosis.steps],
         "undecided": [place_of(key) for key in rivals],
-        "suspects": [suspect._asdict() for suspect in suspects],
+        "suspects": suspects,
         "next": [*advice(accepted, rivals, suspects), *designed],
     }
     write_report(out, "report", document, page(document, figures), diagnosis.before.rig.named)

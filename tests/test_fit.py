@@ -343,7 +343,7 @@ def test_a_finish(monkeypatch, inside, outside, white):
     fakes = {"white_readings": lambda *_: white, "not_diverged": lambda *_: used, "finish": finish, "errors": errors}
     fakes |= {"followed": _followed, "ahead": lambda *_: ()}
     fakes["e_step"] = lambda model, *_, **__: SimpleNamespace(state=PATH, loglik=np.full(4, _mass(model)))
-    fakes["widened"] = lambda *args, key: stated.Stated(2 * args[-1], 0.7)
+    fakes["widened"] = lambda *args, key: (2 * args[-1], 0.7)
     _fake(monkeypatch, identify, **fakes)
     rule, smoother = _CurvatureRule(RULE.prior), SimpleNamespace(tolerant=lambda: None)
     fitted = Identified(None, _state([0.0])._replace(hessian=jnp.ones((1, 1))), rule, None, smoother)

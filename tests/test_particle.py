@@ -101,7 +101,7 @@ def _exact():
 
     @jax.jit
     def run():
-        path = GUIDE.tracked(model, prepare(model, seq))[:2]
+        path = GUIDE.path(model, prepare(model, seq))
         potentials = {name: proposal(model, prepare(model, seq), *path) for name, proposal in PROPOSALS.items()}
         return *path, potentials, jax.grad(loglik, argnums=(0, 1, 2))(model.log_q, model.log_r, jnp.zeros(2))
 

@@ -85,10 +85,8 @@ def _loads(system: AbstractSystem):
 
 
 def measure_scales(rig: Rig, system: AbstractSystem, data: Dataset) -> Scales:
-    """Velocities and accelerations of the measured joints; an unseen joint is given the same kinetic energy.
-
-    The torque of a servo, which nobody logs, is that of its declared numbers at the readings, or where its joint is
-    not read, what the accelerations need.
+    """Those of the measured joints; an unseen one is given the same kinetic energy. The torque of a servo is that of
+    its declared numbers at the readings, or where its joint is not read, what the accelerations need.
     """
     dof = len(system.coordinates)
     y, u = np.asarray(data.y), np.asarray(data.u)

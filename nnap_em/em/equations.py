@@ -38,9 +38,8 @@ class Motion(NamedTuple):
     slowest: float
     """Longest time constant [s]; infinite where nothing decays."""
     growth: float = 0.0
-    """Rate at which neighbouring trajectories leave each other [1/s]; 0 where they do not."""
+    """Rate at which neighbouring trajectories leave each other, in the states `unstable` [1/s]; 0 where they do not."""
     unstable: tuple[str, ...] = ()
-    """States in which they do."""
     kept: tuple[str, ...] = ()
     """States that keep a change of their start: integrators."""
 
@@ -152,10 +151,8 @@ def _along(system: Equations, x: Float[np.ndarray, "row state"], u: Float[np.nda
 
 
 def pace_of(rig: Rig, seen: Motion, rows: int) -> float:
-    """The declared horizon, or eight slowest time constants, half of which after a start it has no effect any more [s].
-
-    A third of a recording at most; the time in which errors grow e-fold where equations are unstable.  Of two digits:
-    programs are shared.
+    """The declared horizon, or eight slowest time constants, at most a third of a recording, or where equations are
+    unstable the time in which errors grow e-fold [s]; of two digits: programs are shared.
     """
     pace = rig.horizon or min(8.0 * seen.slowest, rows * rig.dt / 3)
     if seen.growth and not rig.horizon:

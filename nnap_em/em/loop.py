@@ -1,8 +1,7 @@
 """Expectation-Maximisation: E-step and M-step in turn, over a growing horizon, until nothing changes.
 
-Under a wrong model the smoother of a hidden chaotic joint diverges within a second or two, and a fit to a diverged path
-is worthless: the first epochs see the head of every sequence only, and the horizon grows as the model improves.
-Likelihoods are compared at one horizon only.
+Under a wrong model the smoother of a hidden chaotic joint diverges within a second or two: the first epochs see the
+head of every sequence only, and the horizon grows as the model improves. Likelihoods of one horizon are compared.
 """
 
 import functools
@@ -15,14 +14,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from ..data.dataset import Dataset, horizon
 from ..model.base import AbstractModel, prepare
 from ..numerics.gaussian import Gaussian
 from ..numerics.parallel import each
 from ..numerics.random import keys_of
-from ..smoother.mixture import MixtureSmoother
 from ..smoother.posterior import AbstractSmoother, Posterior, likeliest
 from ..storage.journal import HERE, step
 from .mstep import AbstractMStep, MStepInfo, between, not_diverged
@@ -51,9 +49,8 @@ class EMState(NamedTuple):
     ess: float
     """Mean effective sample size of the last epoch; infinite where nothing is sampled."""
     stage: int = 0
-    """Place in `AbstractMStep.stages` of the rule in use."""
     since: int = 0
-    """Epoch from which on it is."""
+    """Place in `AbstractMStep.stages` of the rule in use, and the epoch from which on it is."""
     stop: str = ""
     """Reason of the end of the last fit: `RESTED`, `STEP_REFUSED` or `SPENT`; empty before one has ended."""
 
@@ -85,8 +82,10 @@ def e_step(
     smoother, too, or about the path that was `kept` of that: the likelier outcome is taken.
     """
     first, second = _alone(model, data, smoother, key=key), smoother.second()
-    some = beyond(first, second)
-    if second is None or not some.size:
+    if second is None or first.width is None or isinstance(first.width, Tracer):  # no numbers within a larger program
+        return first
+    some = np.flatnonzero(~(np.asarray(first.width) <= second.wide))
+    if not some.size:
         return first
     wide = jax.tree.map(lambda a: np.asarray(a)[some], (data, first.state, *[kept] * (kept is not None)))
     path, loglik = each(_likeliest_path, (model, second), wide, together=1 if kept is None else None)
@@ -99,13 +98,6 @@ def _alone(model: AbstractModel, data: Dataset, smoother: AbstractSmoother, *, k
     together = max(1, smoother.room // (data.t.shape[1] * smoother.bytes_per_row))
     outcomes = [each(_smooth, (model, one), batch, together=together) for one in smoother.tries()]
     return outcomes[0] if len(outcomes) == 1 else each(_likeliest, None, outcomes)
-
-
-def beyond(first: Posterior, second: MixtureSmoother | None) -> Int[np.ndarray, " some"]:
-    """Sequences that are too wide for the first smoother; none within a larger program, which has no numbers."""
-    if second is None or first.width is None or isinstance(first.width, Tracer):
-        return np.zeros(0, int)
-    return np.flatnonzero(~(np.asarray(first.width) <= second.wide))
 
 
 def _likeliest_path(common, one) -> tuple[Posterior, Float[Array, ""]]:

@@ -2,10 +2,8 @@
 
 The smoother gives the score by Fisher's identity.  EM would divide it by the complete-data information and crawl where
 the missing part dominates; here it is divided by the observed information of the model linearised about the smoothed
-path, the sum of J'J of whitened innovations [Louis 1982, J. R. Stat. Soc. B 44(2); Lange 1995, ibid. 57(2)].
-
-Torques at velocity nodes and uncertain physical parameters form the vector phi, in which the likelihood is quadratic;
-the network is fitted to that quadratic form by Levenberg-Marquardt.
+path, the sum of J'J of whitened innovations, for torques at velocity nodes and parameters, phi, to whose quadratic form
+the network is then fitted. [Louis 1982, J. R. Stat. Soc. B 44(2); Lange 1995, J. R. Stat. Soc. B 57(2)]
 """
 
 import math

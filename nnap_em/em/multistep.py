@@ -1,7 +1,6 @@
 """Multi-step prediction errors, how everything that is estimated would move them, and a fit to them.
 
-Open-loop predictions begin from the filter at regular starts.  The sensitivities are those of the
-filter up to the start and of the open loop from there on, so that the errors are linear in what is estimated.
+Open-loop predictions begin from the filter at regular starts, up to which sensitivities are those of the filter.
 """
 
 import itertools
@@ -260,8 +259,8 @@ def _sensitivities(common, one) -> Float[Array, "start horizon obs column"]:
 def robust_scale(error: Float[np.ndarray, "seq start horizon obs"]) -> Float[np.ndarray, "seq 1 horizon obs"]:
     """Standard deviation of every sequence at every horizon, by medians; 1 where there is no error.
 
-    The geometric mean of a sequence's own and that of all: by that of all, a few recordings with large errors decide
-    alone; by its own, one with hardly any motion counts as much as any.
+    The geometric mean of its own, by which one with hardly any motion counts as much as any, and that of all, by which
+    a few recordings with large errors decide alone.
     """
     if not error.size:
         return np.ones((error.shape[0], 1, *error.shape[2:]))
@@ -306,8 +305,6 @@ def weighed(predictions: OpenLoop, used: Bool[np.ndarray, " seq"]) -> Float[np.n
     return np.where(sound, size / scale**2 / predictions.overlap[:, None], 0.0)
 
 
-GAUSS_NEWTON_STEPS = 3
-"""Gauss-Newton steps at most."""
 LEAST_FALL = 0.01
 """Share by which a step must lower the error to be taken."""
 
@@ -321,17 +318,14 @@ def finish(
     *,
     shaped: bool = False,
 ) -> Followed:
-    """`model` after Gauss-Newton steps on the multi-step errors of the sequences `used`, each halved until it predicts
-    better over all horizons at which a model is judged.
-
-    Friction, parameters and effects move, `shaped` friction under the prior of its shape; noise and start stay.
-    [Bohlin 2006, "Practical Grey-box Process Identification", for prediction-error fits over several horizons]
+    """`model` after up to three Gauss-Newton steps on the multi-step errors of the sequences `used`, each halved until
+    it predicts better over all horizons at which a model is judged: friction, `shaped` under the prior of its shape,
+    parameters and effects move. [Bohlin 2006, "Practical Grey-box Process Identification", for such fits]
     """
     best = followed(model, m_step.prior, path, data)
     error = errors(best, JUDGED)
-    for _ in range(GAUSS_NEWTON_STEPS):
-        model = best.model
-        weights = m_step.weights(model)
+    for _ in range(3):
+        model, weights = best.model, m_step.weights(best.model)
         predictions = open_loop(best, weights)
         weight = weighed(predictions, used)
         keep = weight > 0

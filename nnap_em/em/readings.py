@@ -8,8 +8,7 @@ from ..data.noise import reading_noise
 from ..model.state_space import StateSpaceModel
 
 OVER, ROWS_BEFORE = 5, 30
-"""Rows over which a change counts as motion, and the rows at rest before the first motion that are kept: as many as
-show where the machine rests."""
+"""Rows over which a change counts as motion, and rows at rest that are kept before the first motion."""
 RESTS = 0.35
 """Share of rows at rest from which on a log determines hardly more of friction than its size: machines that were shaken
 for the purpose rest in 0 to 0.2 of the rows, those that stick in 0.5 to 0.8."""
@@ -52,10 +51,8 @@ def third_differences(y) -> float:
 
 
 def white_readings(data: Dataset, model: StateSpaceModel) -> bool:
-    """True where the readings of all measured coordinates carry white noise that is sampled as it is.
-
-    Where no coordinate is measured, one other reading is enough.  Rates and accelerations are no evidence against it:
-    they may change within a sample.  White readings are no proof of right equations, whose horizons are long.
+    """True where the readings of all measured coordinates carry white noise that is sampled as it is, or where none is
+    measured, one other: rates may change within a sample. Equations, whose horizons are long, need more than that.
     """
     if model.system.simulated:
         return False

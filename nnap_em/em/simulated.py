@@ -2,10 +2,8 @@
 
     e(z, s) = y_{k+h} - g(x_{k+h}(z, s)),   x_k = m_k + W s the start of a window
 
-The derivatives go through the simulation, not about a smoothed path: a model of a few equations may be wrong by as much
-as its signals move. Starts are estimated with the parameters: those of a filter are wrong where its model is.
-[Ljung 1999, "System Identification", 2nd ed., chapter 7, for output errors; More 1978, "The Levenberg-Marquardt
-algorithm", LNM 630; Bock 1983 for many starts]
+with derivatives through the simulation, not about a smoothed path: a model of a few equations may be wrong by as much
+as its signals move. [Ljung 1999, "System Identification", 2nd ed., chapter 7; More 1978, LNM 630; Bock 1983]
 """
 
 import math
@@ -64,7 +62,6 @@ class Starts(NamedTuple):
     """Prior of the states at the starts of all windows."""
 
     mean: Float[np.ndarray, "seq window state"]
-    """Those of a filter."""
     width: Float[np.ndarray, " state"]
     """Standard deviation: as large as the states of the filter."""
 
@@ -75,15 +72,13 @@ class Simulated(NamedTuple):
     model: StateSpaceModel
     prior: ParameterPrior
     z: Float[np.ndarray, " param"]
-    """Parameters in standard deviations of their prior."""
     start: Float[np.ndarray, "seq window state"]
-    """Starts in standard deviations of their prior."""
+    """Parameters and starts in standard deviations of their priors."""
     error: Errors
     """Reading minus prediction; NaN where there is none."""
     columns: Float[np.ndarray, "seq window place obs param"]
-    """Derivatives of the predictions by z."""
     by_start: Float[np.ndarray, "seq window place obs state"]
-    """Derivatives of the predictions by the start."""
+    """Derivatives of the predictions by z and by the start."""
 
     @property
     def observed(self) -> Counts:

@@ -23,15 +23,6 @@ from .quadratic import locals_along
 from .weights import Weights
 
 
-class Stated(NamedTuple):
-    """Reported uncertainty of a fit."""
-
-    hessian: Float[Array, "phi phi"]
-    """Posterior precision of the M-step's weights."""
-    discrepancy: float
-    """Size of the forces that no part of the model describes, in the units of `discrepancy_columns`."""
-
-
 class Errors(NamedTuple):
     """Multi-step errors in a row, what each source moves in them, and their weights."""
 
@@ -55,17 +46,16 @@ def widened(
     hessian: Float[Array, "phi phi"],
     *,
     key: PRNGKeyArray,
-) -> Stated:
-    """Posterior precision reduced by the disagreement of recordings and by model discrepancy.
+) -> tuple[Float[Array, "phi phi"], float]:
+    """Posterior precision reduced by the disagreement of recordings and by model discrepancy; the size of the latter,
+    in the units of `discrepancy_columns`.
 
         H = P + (L^-1 + V)^-1,   V = A^-1 (n / (n - 1) sum_s g_s g_s' + tau^2 sum_k b_k b_k') A^-1
 
-    with P the precision of the prior, P + L = `hessian`, g_s the multi-step score of recording s and A its information,
-    that of the prior with it; a single recording counts as its blocks; b_k is the score of the k-th of many smooth
-    random forces of the state, and tau their size, by the likelihood of the errors that are left. Nothing becomes less
-    certain than the prior. [Huber 1967, Proc. 5th Berkeley Symp. 1, 221; Liang & Zeger 1986, Biometrika 73, 13, for
-    clusters; Muller 2013, Econometrica 81, 1805, for the prior; Kennedy & O'Hagan 2001, J. R. Stat. Soc. B 63, 425, for
-    model discrepancy; Rahimi & Recht 2007, NIPS, for the functions]
+    with P the precision of the prior, P + L = `hessian`, g_s the multi-step score of recording s, or of blocks of a
+    single one, A its information with that of the prior, b_k the score of the k-th of many smooth random forces, and
+    tau their size. [Huber 1967, Proc. 5th Berkeley Symp. 1, 221; Liang & Zeger 1986, Biometrika 73, 13; Muller 2013,
+    Econometrica 81, 1805; Kennedy & O'Hagan 2001, J. R. Stat. Soc. B 63, 425; Rahimi & Recht 2007, NIPS]
     """
     weights = m_step.weights(model)
     other = discrepancy_columns(model, weights, path, data, used, key=key)
@@ -83,8 +73,7 @@ def widened(
     strength, turn = np.linalg.eigh(np.asarray(hessian) - prior)
     half = turn * np.sqrt(np.maximum(strength, 0.0))  # L = half half'
     across = half.T @ np.linalg.solve(information, sources)
-    hessian = jnp.asarray(prior + half @ np.linalg.solve(np.eye(len(half)) + across @ across.T, half.T))
-    return Stated(hessian, force)
+    return jnp.asarray(prior + half @ np.linalg.solve(np.eye(len(half)) + across @ across.T, half.T)), force
 
 
 def of_states(
@@ -142,8 +131,8 @@ def discrepancy_columns(
 def size(errors: Errors, information: Float[np.ndarray, "column column"]) -> float:
     """Standard deviation tau of the strengths of `other`, at its largest likelihood.
 
-    error = estimated x + tau other z + noise, with z standard normal and the size of the noise free; x is projected
-    out as far as the prior lets it. Errors that no such force explains give zero.
+    error = estimated x + tau other z + noise, with z standard normal, the size of the noise free, x projected out as
+    far as the prior lets it; zero where no such force explains errors.
     """
     root = np.sqrt(errors.weight)[:, None]
     estimated, other, error = root * errors.own, root * errors.other, root[:, 0] * errors.error
@@ -159,18 +148,13 @@ def size(errors: Errors, information: Float[np.ndarray, "column column"]) -> flo
     return math.sqrt(float(ratios[best, 0] * noise[best]))
 
 
-BLOCK = 4
-"""Longest horizons in a block of a single recording: errors correlate over one, and pieces of a recording that logs
-hold as sequences are longer."""
-
-
 def clustered(
     scores: Float[np.ndarray, "seq start phi"], overlap: Float[np.ndarray, " horizon"]
 ) -> Float[np.ndarray, "cluster phi"]:
-    """Scores of every recording, or of the blocks of a single one."""
+    """Scores of every recording, or of the blocks of a single one, each of four horizons: errors correlate over one."""
     if len(scores) > 1:
         return scores.sum(axis=1)
-    return np.add.reduceat(scores[0], np.arange(0, scores.shape[1], max(1, round(BLOCK * float(overlap[-1])))))
+    return np.add.reduceat(scores[0], np.arange(0, scores.shape[1], max(1, round(4 * float(overlap[-1])))))
 
 
 def _rows(

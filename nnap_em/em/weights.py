@@ -219,10 +219,7 @@ def _beside(nodes: Float[Array, " count"]) -> Float[Array, "count count"]:
 
 
 def friction_prior(model, weights: Weights) -> tuple[np.ndarray, np.ndarray]:
-    """Precision and pull of phi: the total map free in the span of known laws, the rest small, parameters as declared.
-
-    A prior on its size would bind strong Coulomb friction; one on its change would leave half an effect inside the map.
-    """
+    """Precision and pull of phi: the map free in the span of known laws, the rest small, parameters as declared."""
     nodes, size = np.asarray(weights.nodes), weights.nodes.size + weights.prior.size
     value = np.asarray(weights.phi(model.unknown, weights.read(model)))
     if weights.known is not None:

@@ -211,9 +211,9 @@ def finished(fitted: Identified, data: Dataset) -> Identified:
     elif white_readings(data, fitted.model):
         return fitted._replace(accuracy=ahead(fitted.rig, along.model, before, data))
     problem = fitted.model, fitted.m_step, path, data, used, fitted.state.hessian
-    stated = widened(*problem, key=jax.random.fold_in(fitted.state.key, WIDENED))
-    state, errs = fitted.state._replace(hessian=stated.hessian), ahead(fitted.rig, along.model, before, data)
-    return fitted._replace(state=state, discrepancy=stated.discrepancy, accuracy=errs)
+    hessian, discrepancy = widened(*problem, key=jax.random.fold_in(fitted.state.key, WIDENED))
+    state, errs = fitted.state._replace(hessian=hessian), ahead(fitted.rig, along.model, before, data)
+    return fitted._replace(state=state, discrepancy=discrepancy, accuracy=errs)
 
 
 def _simulating(fitted: Identified, data: Dataset) -> Identified:

@@ -44,6 +44,10 @@ class GaussianSmoother(AbstractSmoother):
         once = dataclasses.replace(self, inflations=(1.0,), branching=False)  # one program, with `second` or without
         return [_Loosened(once, jnp.asarray(math.log(factor), float)) for factor in self.inflations]
 
+    def path(self, model, seq: Prepared) -> tuple[Filtered, Smoothed]:
+        """Filtered and smoothed states of the last iteration."""
+        return self.tracked(model, seq)[:2]
+
     def tracked(self, model, seq: Prepared) -> tuple[Filtered, Smoothed, Float[Array, ""]]:
         """Filtered and smoothed states of the last iteration, and the width of the first pass."""
         start = self.bank.likeliest(model, seq, self.linearise, self.window)

@@ -112,10 +112,8 @@ def linear_reading(model, x: Float[Array, " state"], u: Any) -> Reading:
 
 
 def absorbed(state: Gaussian, reading: Reading, r, y, observed, gate: Any = None):
-    """`state` after readings, one at a time: y_i = rows_i x + offset_i + noise of variance r_i.
-
-    With it the whitened innovations, their log variances and the gains, 0 where nothing is `observed`.  A reading whose
-    innovation is beyond a `gate` [standard deviations] changes nothing: its gain is 0.
+    """`state` after readings, one at a time: y_i = rows_i x + offset_i + noise of variance r_i; whitened innovations,
+    their log variances and gains, 0 where nothing is `observed`, gains also beyond a `gate` [standard deviations].
     """
     mean, cov = state
     rows = reading.rows

@@ -1,16 +1,10 @@
-"""Particle filter that looks ahead.
-
-It targets p(x_{0:k} | y_{0:k}) psi~_{k+1}(x_k), with any Gaussian potentials
+"""Particle filter that looks ahead: it targets p(x_{0:k} | y_{0:k}) psi~_{k+1}(x_k), with any Gaussian potentials
 
     psi_k(x) = exp(linear_k' x - x' precision_k x / 2)          (up to a factor, which cancels)
 
-as proposal:  x_{k+1} ~ N(f(x_k, u_k), Q) psi_{k+1} / psi~_{k+1}(x_k),  where psi~_{k+1} is the integral, and
-the weight grows by g(y_k | x_k) psi~_{k+1}(x_k) / psi_k(x_k).  Weights are exact, so that the likelihood is unbiased
-whatever the potentials; they decide only how many particles survive.
+as proposal, and exact weights (docs/how/smoother.md). Particles are deviations from a reference path in standard
+deviations of the process noise, so that Q = I and single precision is enough; their axis is the last of arrays.
 [Guarniero, Johansen & Lee 2017, J. Am. Stat. Assoc. 112(520), sec. 2; Heng et al. 2020, Ann. Stat. 48(5)]
-
-Particles are held as deviations from a reference path in standard deviations of the process noise, so that Q = I and
-single precision is enough.  Arrays of particles have the particle axis last.
 """
 
 import math

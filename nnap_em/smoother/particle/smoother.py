@@ -39,7 +39,7 @@ class ParticleSmoother(AbstractSmoother):
 
     def history(self, model, seq: Prepared, *, key: PRNGKeyArray) -> ParticleHistory:
         """The filter alone, with its effective sample size."""
-        potentials = self.proposal(model, seq, *self.guide.tracked(model, seq)[:2])
+        potentials = self.proposal(model, seq, *self.guide.path(model, seq))
         size, dtype = self.num_particles, jnp.dtype(self.dtype)
         return particle_filter(model, potentials, seq, num_particles=size, key=key, dtype=dtype)
 

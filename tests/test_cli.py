@@ -15,7 +15,6 @@ from shell import ROOT
 
 from nnap_em.commands import cli
 from nnap_em.commands import identify as identify_command
-from nnap_em.commands import smooth as smooth_command
 from nnap_em.data.rig import read_rig
 from nnap_em.fit.store import load, read
 from nnap_em.model.simulate import examples
@@ -268,12 +267,3 @@ def test_wrong_usage_is_refused(capsys, line):
     with pytest.raises(SystemExit, match="2"):
         cli.main(line.split())
     assert USAGE[line] in capsys.readouterr().err
-
-
-def test_a_mistake_of_ours_is_not_hidden(bench, fit, tmp_path, monkeypatch):
-    def bug(*_):
-        raise ZeroDivisionError
-
-    monkeypatch.setattr(smooth_command, "smooth", bug)
-    with pytest.raises(ZeroDivisionError):
-        nnap("smooth", fit, bench / "test", "--out", tmp_path / "out")

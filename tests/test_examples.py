@@ -55,12 +55,6 @@ def test_the_tanks_run_from_the_recordings_to_the_figure(tmp_path, monkeypatch, 
     errors = [float(value) for value in re.findall(r": ([\d.]+) V", printed)]
     np.testing.assert_allclose(errors, [NOISE, NOISE], rtol=0.15)  # 100 rows
     assert (out / "tanks.png").stat().st_size > 10_000 and (out / "found" / "report.html").exists()
-    file = out / "rig" / "test" / "test.csv"
-    table = np.loadtxt(file, delimiter=",", skiprows=1)
-    table[60, 2] = 10.0  # the end of the range, which no fit reads
-    np.savetxt(file, table, delimiter=",", header="time,u,y", comments="")
-    side = tanks.simulated(out / "fit" / "model.npz", out / "rig")
-    assert side.reading[60] == 10.0 and 0.1 < side.error < 10.0
 
 
 @pytest.mark.slow  # fast: test_public.py

@@ -111,11 +111,6 @@ def test_a_loop_that_held_joints_close_is_no_obstacle(tmp_path):
 
 BAD = {
     "an unknown joint is held": (GRIPPER, "locked = { elbo = 0.0 }", r"locked names 'elbo', .*did you mean 'elbow'"),
-    "both": (
-        GRIPPER,
-        'joints = ["yaw"]\nlocked = { yaw = 0.0 }',
-        r"\[model.locked\] yaw: it is among the joints that move",
-    ),
     "no names": (GRIPPER, "joints = []", r"\[model\] joints: found \[\]; write the names of the joints that move"),
     "nothing moves": (arm(1), "locked = { joint1 = 0.0 }", "it has no joint, or all are held"),
 }

@@ -200,13 +200,12 @@ BAD = {
     "another kind": (
         "hand_touch", "of a sensor of type touch; read are joints, and gyro, accelerometer, framepos of a site: take",
     ),
-    "a place of a body": ("link.x", "is of a sensor of type framepos of no site, or in no frame of the world"),
 }  # fmt: skip
 
 
 @pytest.mark.parametrize(("column", "said"), BAD.values(), ids=BAD)
 def test_sensors_that_are_not_read_are_refused_by_name(column, said, tmp_path):
-    more = '<touch name="hand_touch" site="hand"/><framepos name="link" objtype="body" objname="link1"/>'
+    more = '<touch name="hand_touch" site="hand"/>'
     text = ARM.replace("<sensor>", f"<sensor>{more}")
     with pytest.raises(RigError, match=re.escape(said)):
         read_rig(_rig(tmp_path, text, ["joint1", column]), specs)

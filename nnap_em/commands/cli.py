@@ -24,11 +24,6 @@ examples:
   nnap-em check bench                               whether the logs can identify what is asked
   nnap-em identify bench --out fit                  friction, noise and uncertain parameters from bench/train
   nnap-em diagnose bench --out found                what the declared model lacks, and the error before and after
-  nnap-em design found --out next                   the inputs to play next, so that what is open is answered
-  nnap-em compare monday friday --out changed       what changed between fits of one machine, and what did not
-  nnap-em predict fit bench/test --given 1 --out prediction
-  nnap-em smooth fit bench/test --out smoothed
-  nnap-em export fit --out exported                 all numbers of the model as JSON, with units
 
 A data set is a folder with rig.toml, train/*.csv and, if there is one, test/*.csv.  SI units: s, N m, rad, rad/s.
 """

@@ -15,7 +15,7 @@ from helpers import nnap
 from rigs import slide_logs, slide_rig
 
 from nnap_em import compare
-from nnap_em.comparison.compare import CHANGED, Comparison, corrected, number
+from nnap_em.comparison.compare import CHANGED, Comparison, corrected, quantity
 from nnap_em.comparison.pooling import LEAST_VARIANCE, apart, joint_test, pool
 from nnap_em.data.rig import Declared
 from nnap_em.diagnosis.hypothesis import Hypothesis
@@ -77,7 +77,7 @@ def test_alarms_are_as_frequent_as_the_level_says():
     covs = [_curve_like(rng, 15, fits), _curve_like(rng, 9, fits), *rng.uniform(0.5, 2, (2, fits, 1, 1))]
     roots = [np.linalg.cholesky(cov) for cov in covs]
     alone, together = np.zeros((draws, len(covs))), np.zeros(draws)
-    blank = number("m", "kg", np.ones(2), np.ones(2))
+    blank = quantity("m", (("m", "kg"),), np.ones((2, 1)), np.ones((2, 1)))
     for i in range(draws):
         tests = [
             joint_test(np.einsum("fab,fb->fa", root, rng.standard_normal(root.shape[:2])), cov)
@@ -126,10 +126,11 @@ def test_numbers_that_are_equally_sure_are_pooled_to_their_mean_and_differ_as_co
 
 def test_errors_of_fits_that_differ_are_widened_to_the_difference():
     """As Birge has it: with them the statistic is its degrees of freedom; two numbers 5 standard deviations apart."""
-    far = number("m", "kg", np.asarray([1.0, 1.0 + 5 * math.sqrt(2)]), np.ones(2))
+    row = (("m", "kg"),)
+    far = quantity("m", row, np.asarray([[1.0], [1.0 + 5 * math.sqrt(2)]]), np.ones((2, 1)))
     assert far.difference[0] == pytest.approx(5.0)
     assert (far.pooled.value[0], far.pooled.std[0]) == pytest.approx((far.value.mean(), 5 / math.sqrt(2)))
-    near = number("m", "kg", np.asarray([1.0, 1.1]), np.ones(2))
+    near = quantity("m", row, np.asarray([[1.0], [1.1]]), np.ones((2, 1)))
     assert near.pooled.std[0] == pytest.approx(1 / math.sqrt(2))
 
 

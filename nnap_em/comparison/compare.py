@@ -132,7 +132,6 @@ def _labels(fits: Sequence[Path | str | Identified]) -> tuple[str, ...]:
 
 
 def _check(pair: Mapping[str, Identified]) -> None:
-    """Refuse fits of different machines."""
     names, sides = " and ".join(pair), [_machine(fit) for fit in pair.values()]
     for what, one in sides[0].items():
         if (other := sides[1].get(what, one)) != one:
@@ -176,7 +175,6 @@ def _curves(fits: Sequence[Identified]) -> Iterator[Quantity]:
 
 
 def _numbers(fits: Sequence[Identified]) -> Iterator[Quantity]:
-    """The estimated parameters of the machine and of effects."""
     tables = [_estimates(fit) for fit in fits]
     for name in dict.fromkeys(itertools.chain(*tables)):
         entries = [table.get(name) for table in tables]
@@ -186,7 +184,8 @@ def _numbers(fits: Sequence[Identified]) -> Iterator[Quantity]:
             value = first + np.remainder(value - first + np.pi, 2 * np.pi) - np.pi
         priors = (fit.rig.parameters[name].std for fit in fits if name in fit.rig.parameters)
         prior = min((prior for prior in priors if prior > 0), default=np.inf)
-        yield number(name, next(entry.unit for entry in entries if entry is not None), value, std, prior)
+        unit = next(entry.unit for entry in entries if entry is not None)
+        yield quantity(name, ((name, unit),), value[:, None], std[:, None], prior_std=prior)
 
 
 def _estimates(fitted: Identified) -> dict[str, Estimate]:
@@ -200,25 +199,21 @@ def _estimates(fitted: Identified) -> dict[str, Estimate]:
     }
 
 
-def number(
-    name: str, unit: str, value: Float[np.ndarray, " fit"], std: Float[np.ndarray, " fit"], prior_std: float = np.inf
-) -> Quantity:
-    """A number, tested and pooled over the fits that estimate it."""
-    has = np.isfinite(value) & np.isfinite(std) & (std > 0)
-    test = joint_test(value[has, None], std[has, None, None] ** 2) if has.sum() > 1 else None
-    return quantity(name, ((name, unit),), value[:, None], std[:, None], test, prior_std)
-
-
 def quantity(
     name: str,
     rows: tuple[tuple[str, str], ...],
     value: Float[np.ndarray, "fit number"],
     std: Float[np.ndarray, "fit number"],
-    test: JointTest | None,
+    test: JointTest | None = None,
     prior_std: float = np.inf,
 ) -> Quantity:
-    """Numbers with their differences, pooled over the fits that estimate them; their prior has std `prior_std`."""
+    """Numbers with their differences, pooled over the fits that estimate them; their prior has std `prior_std`.
+
+    One number alone is tested by its standard deviations.
+    """
     has = (np.isfinite(value) & np.isfinite(std) & (std > 0)).all(axis=1)
     values, stds = value[has], std[has]
+    if len(rows) == 1 and len(values) > 1:
+        test = joint_test(values, stds[..., None] ** 2)
     pooled = pool(values, stds, max(prior_std, stds.max(initial=0.0)), test)
     return Quantity(name, rows, value, std, apart(values, stds), pooled, test)

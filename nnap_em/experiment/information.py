@@ -74,7 +74,6 @@ def linearised(fit: Fit, seq: Dataset, x: Float[Array, "time state"]) -> tuple[L
 
 
 def _speeds(path: Gaussian, dof: int) -> Float[Array, "time point dof"]:
-    """All that the path may have."""
     v = path.mean[:, None, dof : 2 * dof]
     std = jnp.sqrt(jnp.maximum(jnp.diagonal(path.cov, axis1=1, axis2=2), 0.0))[:, None, dof : 2 * dof]
     points = jnp.asarray(

@@ -78,6 +78,5 @@ def limits_of(
 
 
 def _bounds(names: Sequence[str], declared: Mapping[str, Range], low, high) -> tuple[np.ndarray, np.ndarray]:
-    """Declared bounds, and others where there are none."""
     pairs = [declared.get(name, (lo, hi)) for name, lo, hi in zip(names, low, high, strict=True)]
     return tuple(np.array(pairs, float).T)  # type: ignore[return-value]

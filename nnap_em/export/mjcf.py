@@ -158,7 +158,6 @@ def _bodies(simulated: Any, system: Tree) -> None:
 
 
 def _acting_on(file: OpenFile, joint: str, name: str, gear: float) -> Any:
-    """A new motor of a joint, with nothing of the classes of the file."""
     motor = file.spec.add_actuator(name=name, target=joint, trntype=mujoco().mjtTrn.mjTRN_JOINT)
     motor.set_to_motor()
     motor.gear = [gear, 0.0, 0.0, 0.0, 0.0, 0.0]

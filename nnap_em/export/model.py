@@ -91,7 +91,6 @@ def _pairs(names: tuple[str, ...], values: np.ndarray) -> dict[str, float]:
 
 
 def _friction(fitted: Identified) -> list[dict[str, Any]]:
-    """The learned map of each joint as a table."""
     table = friction_table(fitted, fitted.m_step.weights(fitted.model).nodes)
     columns = {"velocity": table.velocity, "torque": table.torque, "torque_std": table.std}
     return [

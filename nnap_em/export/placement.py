@@ -119,7 +119,6 @@ def sensor(file: OpenFile, column: str) -> Any:
 
 
 def _joint_sensor(file: OpenFile, column: str) -> Any:
-    """A new sensor of a joint, by the name of its state."""
     joints, kinds = file.system.machine.joints, mujoco().mjtSensor
     rate, place = divmod(file.system.machine.states.index(column), len(joints))
     kind = kinds.mjSENS_JOINTVEL if rate else kinds.mjSENS_JOINTPOS

@@ -102,7 +102,6 @@ class _Writer:
         self.lines: dict[Any, Line] = {}
 
     def needed(self, results: Sequence[Any]) -> tuple[Line, ...]:
-        """The lines that the results hang on."""
         alive, kept = set(filter(_is_name, results)), []
         for line in reversed(self.lines.values()):
             if line.name in alive:
@@ -280,7 +279,6 @@ def _kind(atom: Any) -> str:
 
 
 def _typed(value: np.ndarray, atom: Any) -> jax.Array:
-    """Numbers alone, of the type that JAX has for them."""
     return jnp.asarray(value.tolist(), atom.aval.dtype).reshape(value.shape)
 
 
@@ -302,7 +300,6 @@ def _refuse(equation: core.JaxprEqn) -> None:
 
 
 def _by_jax(equation: core.JaxprEqn, operands: list[np.ndarray]) -> list[np.ndarray]:
-    """Numbers alone: JAX computes them."""
     outputs = equation.primitive.bind(*map(_typed, operands, equation.invars), **equation.params)
     return [_array(x) for x in (outputs if equation.primitive.multiple_results else [outputs])]
 

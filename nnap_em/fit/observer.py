@@ -66,24 +66,21 @@ class Observation(NamedTuple):
 
 
 class _Memory(NamedTuple):
-    """State of the filter between rows."""
+    """State of the filter between rows: all branches with the log of their weights, 0 for the likeliest and -inf for a
+    free place; memory of what lies between commands and drives, inputs that are held, what they and those of the row
+    before set at the drives; readings that wait for the input of their row, else NaN; time on the clock of the logs and
+    since the first row, below 0 before it [s]; rows since the last start, up to `SETTLING`."""
 
     branches: Gaussian
     log_weight: Float[Array, " branch"]
-    """0 for the likeliest, -inf for a free place."""
     commands: Any
-    """Memory of what lies between commands and drives."""
     u: Float[Array, " column"]
-    """Inputs that are held, then what they and those of the row before set at the drives."""
     fed: Float[Array, " input"]
     past: Float[Array, " input"]
     late: Float[Array, " obs"]
-    """Readings that wait for the input of their row; NaN where none does."""
     time: Float[Array, ""]
-    """On the clock of the logs [s]; `age`: since the first row, below 0 before it."""
     age: Float[Array, ""]
     rows: Float[Array, ""]
-    """Rows since the last start, up to `SETTLING`."""
 
 
 class Observer(NamedTuple):
@@ -104,7 +101,7 @@ class Observer(NamedTuple):
 
 
 class _Row(NamedTuple):
-    """Inputs and readings of one row, as the filter takes them."""
+    """Inputs and readings of one row, as the filter takes them: `held` over the interval before, `here` at readings."""
 
     first: Bool[Array, ""]
     u: Float[Array, " column"]
@@ -114,7 +111,6 @@ class _Row(NamedTuple):
     late: Float[Array, " obs"]
     gate: Float[Array, ""]
     held: Inputs
-    """Inputs over the interval before the row; `here`: at its readings."""
     here: Inputs
     flags: Int[Array, ""]
     time: Float[Array, ""]

@@ -144,7 +144,6 @@ def parameter_entries(design: Design) -> dict[str, dict[str, Any]]:
 
 
 def _verdict(document: dict[str, Any]) -> str:
-    """Use of the experiment, in one sentence."""
     gains, near = [], [entry["near_rest"] for entry in document["friction"]]
     if near:
         times = {side: listed([number(std["now"] / std[side], 2) for std in near]) for side in near[0]}
@@ -250,7 +249,6 @@ def motion_figure(design: Design, names: Names, which: Sequence[int]) -> Figure:
 
 
 def _within(ax: Axes, low: float, high: float, shown: Sequence[Any]) -> None:
-    """Axis around what is shown, with the limits where they are in it."""
     ax.set_ylim(*limits(shown, 0.3))
     for edge in (low, high):
         ax.axhline(edge, color=BEFORE, ls="--", lw=0.9, label="limit")

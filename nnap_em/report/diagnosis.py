@@ -135,7 +135,6 @@ def _residual_pictures(left: Mapping[str, Residual], names: Names) -> list[Pictu
 
 
 def _effect_pictures(accepted: list[Finding]) -> list[Picture]:
-    """Learned functions, and what is left beside a law."""
     out = []
     for finding in accepted:
         if (curve := finding.curve) is not None:

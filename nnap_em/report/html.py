@@ -89,7 +89,6 @@ def rendered(
 
 @functools.cache
 def _template() -> jinja2.Template:
-    """The one template, which escapes all text."""
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("nnap_em", "report"), autoescape=True, trim_blocks=True, lstrip_blocks=True
     )

@@ -135,7 +135,6 @@ def _log_summary(document: dict[str, Any], log: Log) -> None:
 
 
 def _velocities(fitted: Identified, train: Logs, epochs: list[dict[str, Any]]) -> Float[np.ndarray, "sample dof"]:
-    """Smoothed velocities of the training sequences that took part."""
     mean = np.asarray(posterior_of(fitted, train.data).state.mean)
     valid = np.array(train.data.valid)
     valid[epochs[-1]["left_out"]] = False
@@ -145,7 +144,6 @@ def _velocities(fitted: Identified, train: Logs, epochs: list[dict[str, Any]]) -
 
 
 def _draw(path: Path, fitted: Identified, table: FrictionTable, visited: Float[np.ndarray, "sample dof"]) -> Picture:
-    """The learned maps as a file of their own, and for the page."""
     figure, image = friction_figure({"learned": table}, names_of(fitted), list(visited.T)), io.BytesIO()
     figure.savefig(image, format="png", metadata={"Software": "written by nnap_em"})
     replace_bytes(path, image.getvalue())

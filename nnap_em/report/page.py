@@ -61,7 +61,6 @@ def _found(document: _Entry) -> list[Part | None]:
 
 
 def _effect(effect: _Entry, doubted: bool) -> Section | None:
-    """An effect with its meaning, its parameters and what was measured about it."""
     law, text = catalogue.get(effect.get("name") or ""), effect.get("description") or ""
     meaning, words = (law.meaning, law.words) if law else ("", {})
     if "±" in text and meaning and not effect.get("shape") and effect.get("name") != "unknown_function":
@@ -150,7 +149,6 @@ def _change(before: Any, after: Any) -> str:
 
 
 def _failures(before: Sequence[_Entry], after: Sequence[_Entry] | None) -> str:
-    """Numbers of tests that fail, without those that fail by little."""
     sides = {"before": before, "after": after} if after else {"": before}
     counts = {
         side: sum(finite(t["p_value"]) and t["p_value"] < FAILS and not t.get("slight") for t in tests)
@@ -222,5 +220,4 @@ def _std(entry: _Entry) -> str:
 
 
 def _sides(entries: _Entry) -> _Entry:
-    """Numbers before and after, of a fit one side of them."""
     return entries if "before" in entries else {"fitted": entries} if entries else {}

@@ -60,12 +60,10 @@ def _causes(residuals: Sequence[Residual], names: Names) -> Iterator[tuple[str, 
 
 
 def _followed(residual: Residual) -> Residual:
-    """Sequences that are followed; all where there is none."""
     return (residual if residual.used.any() else residual._replace(used=~residual.used)).followed()
 
 
 def _sides(residual: Residual, after: Residual | None, labels: tuple[str, str]) -> list[tuple[Residual, str, str]]:
-    """Residual, colour and name of every model."""
     sides = [(_followed(residual), BEFORE, labels[0])]
     return sides if after is None else [*sides, (_followed(after), AFTER, labels[1])]
 
@@ -115,7 +113,6 @@ def residual_figure(residual: Residual, names: Names, after: Residual | None = N
 
 
 def _panels(residuals: Sequence[Residual], names: Names, joint: int, bins: int) -> list[_Panel]:
-    """The force at one joint against every cause."""
     out = []
     for label, values in _causes(residuals, names):
         seen = values[0][np.isfinite(values[0]) & np.isfinite(residuals[0].force[..., joint])]
@@ -132,7 +129,6 @@ def _share(panel: _Panel) -> float:
 
 
 def _reach(panels: Sequence[_Panel]) -> float:
-    """Half height of the panels of a joint."""
     ends = [np.abs(curve.mean) + np.nan_to_num(NORMAL_90 * curve.std) for _, curves in panels for curve in curves]
     return 1.15 * max(1e-12, *(float(np.nanmax(end, initial=0.0)) for end in ends))
 

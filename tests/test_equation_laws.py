@@ -211,6 +211,16 @@ def test_a_declared_unknown_term_is_part_of_the_model(chain, tmp_path):
     assert [ax.get_xlabel() + ax.get_ylabel() for ax in term_figure(table).axes] == ["b [V]f [V/s]"]
 
 
+@pytest.mark.slow  # fast: test_a_search_that_fails_late_or_is_out_of_time_keeps_what_it_has
+@pytest.mark.parametrize(("coupling", "names"), [(0.25, {("a", ("b",))}), (0.0, set())], ids=["planted", "nothing"])
+def test_a_missing_flow_is_named_and_nothing_where_nothing_is_missing(tmp_path, coupling, names, monkeypatch):
+    monkeypatch.setattr(equations, "PARTNERS", 4)  # 6 pairs in place of 120
+    data = _logs(coupling)
+    before = identify(_rig(tmp_path), data, key=jax.random.key(0))
+    closed = search_equations(before, data, lambda text: None)
+    assert {(effect.channel, effect.reads) for effect in closed.after.model.effects} == names
+
+
 def test_a_search_that_fails_late_or_is_out_of_time_keeps_what_it_has(chain, monkeypatch):
     """Fits of sensors are singular, fits of two laws are out of time: the flow that was found first is reported."""
     (before, data), whole = chain, equations.simulated.fit_all

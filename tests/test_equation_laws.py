@@ -20,7 +20,7 @@ from nnap_em.effects.equations import UnknownTerm
 from nnap_em.em.equations import free_term, motion
 from nnap_em.em.prior import ParameterPrior
 from nnap_em.em.simulated import Simulated, Windows
-from nnap_em.fit.identify import begin
+from nnap_em.fit.identify import begin, identify
 from nnap_em.init.equations import draft_equations
 from nnap_em.model.state_space import Inputs
 from nnap_em.report.document import unknown_terms as reported_terms

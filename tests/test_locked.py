@@ -109,7 +109,9 @@ def test_a_loop_that_held_joints_close_is_no_obstacle(tmp_path):
         read_machine(tmp_path / "loop.xml", part)
 
 
+BALL = arm(1).replace("</worldbody>", '<body><joint name="ball" type="ball"/><geom size=".1"/></body></worldbody>')
 BAD = {
+    "a ball at a number": (BALL, "locked = { ball = 0.3 }", "'ball' turns as a ball.*; name those that move in joints"),
     "an unknown joint is held": (GRIPPER, "locked = { elbo = 0.0 }", r"locked names 'elbo', .*did you mean 'elbow'"),
     "no names": (GRIPPER, "joints = []", r"\[model\] joints: found \[\]; write the names of the joints that move"),
     "nothing moves": (arm(1), "locked = { joint1 = 0.0 }", "it has no joint, or all are held"),

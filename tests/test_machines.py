@@ -314,6 +314,16 @@ def test_bad_files_are_refused_by_name_with_the_mend(tmp_path, text, uncertain, 
     assert str(tmp_path) in str(refused.value)  # and where
 
 
+def test_the_rotor_of_a_transmission_is_said_to_be_left_out(tmp_path, recwarn):
+    path, block = tmp_path / "m.urdf", '\n<transmission name="t"><joint name="j1"/>{}</transmission>'
+    path.write_text(_urdf(ARM + block.format("<mechanicalReduction>101</mechanicalReduction>")))
+    plain = read_machine(path)  # torques are those at the joint
+    assert not recwarn
+    path.write_text(_urdf(ARM + block.format("<motorInertia>5e-5</motorInertia>")))
+    with pytest.warns(RigWarning, match="the rotor of a <transmission> is not read; write its inertia times"):
+        assert read_machine(path) == plain
+
+
 def test_a_missing_file_is_refused(tmp_path):
     path = _rig(tmp_path, arm(1))
     (tmp_path / "machine.xml").unlink()

@@ -53,7 +53,7 @@ def parser() -> argparse.ArgumentParser:
         commands[name] = under.add_parser(name, help=short, description=summary, epilog=examples, **form)
     commands["machine"] = commands["init"].add_mutually_exclusive_group()
 
-    def add(to: str, name: str, text: str, metavar: str | None = None, kind: Any = None, **more: Any) -> None:
+    def add(to: str, name: str, text: str, metavar: Any = None, kind: Any = None, **more: Any) -> None:
         """Add an argument to some commands: a path where it has the name of a value alone."""
         more |= {"metavar": metavar} if metavar else {}
         more |= {"type": kind or Path} if kind or metavar else {}
@@ -71,8 +71,7 @@ def parser() -> argparse.ArgumentParser:
     add("simulate", "--measured", "which states are read", "STATE", str, nargs="+")
     for option, what in (("process", "kick per step"), ("measurement", "readings")):
         text = f"standard deviations: {what} of positions [rad or m] and of rates [rad/s or m/s]"
-        pair: Any = ("POSITION", "RATE")
-        add("simulate", f"--{option}-noise", text, pair, _positive, nargs=2)
+        add("simulate", f"--{option}-noise", text, ("POSITION", "RATE"), _positive, nargs=2)
     add("init", "log", "a CSV file with a header, MCAP, ROS bag or HDF5", "LOG")
     add("machine", "--system", "the machine, where the columns do not determine it", choices=SYSTEMS)
     text = 'the machine as MJCF or URDF, which stays where it is, or "equations" to be written'

@@ -85,6 +85,13 @@ def _hold(path: Path, spec: Any, part: Part) -> None:
     _refuse_all(path, model, part)
     single = [j for j in range(model.njnt) if _kind("mjtJoint", model.jnt_type[j]) in ("slide", "hinge")]
     zeros = {model.joint(j).name: float(model.qpos0[model.jnt_qposadr[j]]) for j in single}
+    for name in part.locked:
+        if name not in zeros:
+            refuse(
+                path,
+                f"[model] locked: {name!r} turns as a ball, no number is its place",
+                "name those that move in joints",
+            )
     values = {name: part.locked.get(name, zero) for name, zero in zeros.items() if part.holds(name)}
     follows = _couplings(model)
     for _ in follows:  # a joint may follow one that follows another

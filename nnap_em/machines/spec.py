@@ -52,6 +52,9 @@ def opened(path: Path) -> Any:
     for line in heard:
         if "equal lower and upper limits" not in line:  # a limit without room is none
             warnings.warn(f"{path}: {line}", RigWarning, 2)
+    if re.search(r"(?is)<transmission\b(?:(?!</transmission>).)*<\w*inertia", text):
+        hint = "write its inertia times the reduction squared as JOINT.armature in [model.uncertain]"
+        warnings.warn(f"{path}: the rotor of a <transmission> is not read; {hint}", RigWarning, 2)
     for body in [body for body in spec.bodies[1:] if "<robot" in text and not body.explicitinertial]:
         body.explicitinertial, body.ipos = True, [0.0, 0.0, 0.0]
     return spec

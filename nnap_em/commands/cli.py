@@ -173,7 +173,7 @@ def _log(text: str) -> None:
     print(f"nnap-em: {text}", file=sys.stderr, flush=True)
 
 
-def _number(text: str, kind: Callable[[str], float], low: float, form: str) -> Any:
+def _number(text: str, kind: Callable[[str], float], low: int | float, form: str) -> Any:
     try:
         if low <= (value := kind(text)) < math.inf:
             return value

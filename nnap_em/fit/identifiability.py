@@ -1,7 +1,7 @@
 """Identifiability: uncertain numbers that no motion depends on, or only in combination with others."""
 
 import dataclasses
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -109,7 +109,7 @@ def sentences(result: Identifiability) -> list[str]:
     return [never] * bool(result.never) + [f"motions determine {', '.join(g)} {kept}" for g in result.together]
 
 
-def not_identifiable(rig: Rig, system: AbstractSystem, data: Dataset) -> tuple[str, ...]:
+def not_identifiable(rig: Rig, system: Any, data: Dataset) -> tuple[str, ...]:
     """The uncertain parameters that carry the scale of the machine, where it is not identifiable; else none.
 
     Without a torque the motion is the same when M(q) and c(q, v) are multiplied by one number, and the learned friction

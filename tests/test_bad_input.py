@@ -148,8 +148,9 @@ def _lost(log):
 WARNINGS = {  # what may be meant: name: (the change of the folder, the words of the warning)
     "gap": (_log_file(lambda s: s.replace(s.splitlines()[6] + "\n", "")),
         "line 7, column 'time' | a gap: 0.04 s, then 0.06 s (1 row missing in all) | inputs there are interpolated"),
-    "long gap": (_log_file(lambda _: csv_text(_lost(swing()))),
-        "line 102, column 'time' | a gap: 0.99 s, then 1.1 s (91 rows after it in all) | nnap-em import"),
+    "gap in noisy inputs": (
+        _log_file(lambda _: csv_text(_lost(swing()) | {"u": np.random.default_rng(0).normal(0.0, 0.1, 191)})),
+        "line 102, column 'time' | a gap: 0.99 s, then 1.1 s (91 rows after it in all) | cannot be interpolated"),
     "spike": (_log_file(with_field(50, "theta1", "0.5")),
         "line 50, column 'theta1' | reading far from what the readings before and after say (spike) | first at 0.48"),
     "stuck": (_log_file(_column("theta1", lambda x: np.where(np.arange(x.size) // 40 == 2, x[80], x))),

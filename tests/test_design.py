@@ -39,7 +39,7 @@ THREE = {"seconds": 2.4, "sequences": 3, "effort": SMALL}
 
 
 def test_inputs_keep_to_torque_and_its_change():
-    """Of every family, and of mutations, whose numbers stay between 0 and 1."""
+    """Every family and its mutations stay within both limits; numbers of a mutation stay between 0 and 1."""
     rng, t = np.random.default_rng(3), 0.01 * np.arange(301)
     proposals = drawn(rng, 40, 2, 2)
     other = mutated(rng, proposals, 0.5)

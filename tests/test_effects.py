@@ -228,7 +228,7 @@ def test_units_are_those_of_the_machine_and_the_channel():
 
 
 def test_a_linear_law_is_tried_from_no_strength():
-    """What its probes move is zero at the start: of such laws the comparisons above are with no effect."""
+    """The numbers that the probes of a linear law move are zero at its start, where it has no effect."""
     model = declared_model(plant.Case(steps=20, hidden=False))
     numbers = lambda e: np.concatenate([np.ravel(getattr(e, name)) for name in fields(e)])  # noqa: E731
     every = [candidate for kind in catalogue.values() for candidate in kind.candidates(around(model))]

@@ -42,7 +42,7 @@ def test_law_limits_are_those_of_the_formula():
 
 
 def test_noise_free_table_returns_its_law():
-    """Of the errors of a learned curve, and of independent ones."""
+    """Correlated errors, as of a learned curve, and independent ones give the same numbers."""
     v = _nodes()
     both = (fit_law(v, _torque(v), cov) for cov in (1e-6 * np.eye(v.shape[1])[None], _kernel(v, 1e-3)))
     for fit in both:

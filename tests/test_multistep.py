@@ -155,7 +155,7 @@ def test_a_probe_gives_the_same_column_beside_all_others_as_alone(known, around)
 
 
 def test_a_fit_to_multi_step_errors_finds_the_parameter(known):
-    """Of a machine that is 4 % heavier, read without noise, the fit finds the mass and the errors fall."""
+    """The fit finds the mass of a machine that is 4 % heavier, read without noise, and the errors fall."""
     heavy = eqx.tree_at(lambda m: m.system.m, known.model, 1.04 * known.model.system.m)
     x = _moves(heavy, known.path.mean[:, 0], known.data)
     mean = jnp.ravel(known.model.system.m)

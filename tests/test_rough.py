@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 from nnap_em import read_logs
 from nnap_em.data.dataset import DataError
 from nnap_em.data.formats import write_csv
-from nnap_em.data.logs import Logs
+from nnap_em.data.logs import DataWarning, Logs
+from nnap_em.data.missing import interpolated
 from nnap_em.data.plausible import Columns
 from nnap_em.data.rough import rough
 
@@ -113,6 +114,14 @@ def test_a_column_alone_is_stuck_where_it_wakes_up_elsewhere():
     assert _faults({"theta1": alone}) == {("stuck", "theta1"): set(range(151, 201))}
 
 
+def test_a_column_alone_is_stuck_where_its_noise_is_gone():
+    """About the top of a sine, where it wakes up where it stood; without noise it is a joint that rests."""
+    for noise, found in ((0.005, {("stuck", "theta1"): set(range(101, 210))}), (0.0, {})):
+        alone = np.sin(np.pi * np.arange(311) / 310) + noise * np.random.default_rng(0).standard_normal(311)
+        alone[101:210] = alone[100]
+        assert _faults({"theta1": alone}) == found
+
+
 def test_one_count_of_an_encoder_is_no_spike_of_its_rate():
     """A rate that is filtered from steps; one of twice the size is masked."""
     counts = np.where(np.arange(ROWS) > 250, 1e-3, 0.0)
@@ -139,6 +148,23 @@ def test_a_late_and_a_saturated_sensor_are_found():
     ((what, rows),) = _faults(readings).items()
     assert what == ("saturated", "dtheta1") and beyond <= rows
     assert len(rows - beyond) <= 1  # the reading at the limit
+
+
+@pytest.mark.parametrize("length", [1, 8, 25])
+def test_an_input_of_sines_is_told_over_a_gap(length):
+    t = DT * np.arange(ROWS)
+    u = 0.2 * np.sin(7 * t) + 0.1 * np.sin(23 * t + 1)
+    lost = (np.arange(ROWS) >= 200) & (np.arange(ROWS) < 200 + length)
+    filled = interpolated(np.where(lost, np.nan, u), lost)
+    np.testing.assert_allclose(filled.u, u, atol=1e-3)
+    assert (filled.error[lost] < 0.01).all()
+    assert (filled.error[~lost] == 0).all()
+
+
+def test_an_input_of_noise_is_not_trusted_over_a_gap():
+    u, lost = np.random.default_rng(0).standard_normal(ROWS), np.arange(ROWS) // 8 == 25
+    assert (interpolated(np.where(lost, np.nan, u), lost).error[lost] > 1).all()
+    assert interpolated(np.where(lost, np.nan, 0.0), lost).u.tolist() == [0.0] * ROWS
 
 
 # --- through the reader
@@ -192,22 +218,35 @@ def test_a_prediction_knows_nothing_of_later_readings(tmp_path):
     np.testing.assert_array_equal(seen[0][1], seen[1][1])
 
 
-def test_lost_rows_come_back_without_readings_and_a_log_ends_at_a_longer_gap(tmp_path):
+def test_lost_rows_come_back_without_readings_and_a_log_ends_where_inputs_cannot_be_told(tmp_path):
     columns, kept = swing(), np.ones(201, bool)
-    kept[50:52] = kept[100] = False
+    kept[50:60] = kept[100] = False
     _write(tmp_path, columns, kept)
     logs, (said,) = _read(tmp_path)
-    assert "line 52, column 'time': a gap: 0.49 s, then 0.52 s (3 rows missing in all)" in said
+    assert "line 52, column 'time': a gap: 0.49 s, then 0.6 s (11 rows missing in all)" in said
     np.testing.assert_allclose(logs.data.t[0], columns["time"], atol=1e-9)
-    np.testing.assert_allclose(logs.data.u[0, :, 0], columns["u"], atol=0.1 * 0.01**2)  # a line over 0.03 s of a sine
+    np.testing.assert_allclose(logs.data.u[0, :, 0], columns["u"], atol=1e-4)
     np.testing.assert_array_equal(np.isnan(logs.data.y[0]).all(axis=1), ~kept)
-    assert [(m.kind, m.row, m.amount) for m in logs.masked] == [("gap", 51, 3)]
-    _write(tmp_path, columns, np.arange(201) // 3 != 40)
+    assert [(m.kind, m.row, m.amount) for m in logs.masked] == [("gap", 51, 11)]
+    _write(tmp_path, columns | {"u": np.random.default_rng(0).standard_normal(201)}, np.arange(201) // 5 != 24)
     logs, (said,) = _read(tmp_path)
-    assert "a gap: 1.19 s, then 1.23 s (78 rows after it in all)" in said and "nnap-em import" in said
+    assert "inputs before these rows cannot be interpolated" in said
     assert logs.data.valid.sum() == 120
-    assert [(m.kind, m.row, m.amount) for m in logs.masked] == [("cut", 121, 78)]
+    assert [(m.kind, m.row, m.amount) for m in logs.masked] == [("cut", 121, 76)]
     for kept in (np.arange(201) % 3 > 0, (np.arange(201) < 60) | (np.arange(201) > 140)):
         _write(tmp_path, swing(), kept)
         with pytest.raises(DataError, match=r"a gap|rows are"):
             read_logs(tmp_path, swing_rig(clock="session"))
+
+
+def test_a_limit_seen_in_one_file_holds_for_all(tmp_path):
+    """The second file touches it twice only."""
+    t = DT * np.arange(301)
+    for i, size in enumerate((4.0, 3.006)):
+        rate = np.minimum(size * np.cos(2 * t + 1), 3.0)
+        columns = {"time": t, "u": 0 * t, "theta1": size / 2 * np.sin(2 * t + 1), "dtheta1": rate}
+        write_csv(tmp_path / f"{i}.csv", columns)
+    with pytest.warns(DataWarning):
+        logs = read_logs(tmp_path, swing_rig())
+    assert {(m.file, m.kind, m.column) for m in logs.masked} == {(f"{i}.csv", "saturated", "dtheta1") for i in range(2)}
+    assert not (np.asarray(logs.data.y)[..., 1] == 3.0).any()

@@ -364,7 +364,8 @@ def _check_names(path: Path, names: Sequence[str], required: Sequence[str], gaps
         if name not in names:
             reads = "or `nnap-em import` it: it reads other names, separators and clocks"
             other = reads if name == "time" else "or correct the columns of rig.toml"
-            refuse(path, f"{line}column {name!r}", "missing", f"{header_hint(path) or nearest(name, spare)}; {other}")
+            hint = header_hint(path) or (nearest(name, spare) if spare else "log it")
+            refuse(path, f"{line}column {name!r}", "missing", f"{hint}; {other}")
         if names.count(name) > 1:
             refuse(path, f"{line}column {name!r}", f"stands there {names.count(name)} times", "keep one of them")
 

@@ -15,13 +15,13 @@ from .dataset import DataError, Dataset, pad
 from .formats import columns_of, header_hint, log_files, place, refuse, table_of, untimed
 from .held import hold
 from .held import repeats as held_rows
+from .missing import interpolated
 from .plausible import implausible, repeats
 from .rig import Rig
-from .rough import Rough, rough
+from .rough import FULL, Rough, rough
 from .units import is_episode, other_unit
 
 TOLERANCE = 0.01  # of the declared dt, for every interval
-LOST = 2  # rows that follow each other over which inputs are interpolated
 OTHER_UNIT = 100.0  # times the declared value of a column that scales a servo: V beside mV, and no gain changes so much
 REPEAT, RANGE = "held", "range"
 _Parts = tuple[np.ndarray, np.ndarray, np.ndarray]
@@ -107,7 +107,16 @@ def read_logs(folder: Path | str, rig: Rig, *, trust: bool = False, until: float
         early = [table.readings(rig, until) for table in tables]
         stands = {name: hold([readings[name] for readings in early]) for name in rig.measured}
         tables = [_without(table, _repeats(table, stands, rig), rig) for table in tables]
-        used = [_without(table, rough(table.readings(rig, until), rig.dt), rig) for table in tables]
+        early = [table.readings(rig, until) for table in tables]
+        entries = [rough(readings, rig.dt) for readings in early]
+        full = {
+            (one.column, y)
+            for readings, found in zip(early, entries, strict=True)
+            for one in found if one.kind == FULL
+            for y in readings[one.column][one.rows]
+        }  # fmt: skip
+        entries = [rough(readings, rig.dt, full) for readings in early] if full else entries
+        used = [_without(table, found, rig) for table, found in zip(tables, entries, strict=True)]
     for table in used:
         _check_plausible(table, rig)
     data, masked = pad([table.parts(rig) for table in used]), tuple(m for table in used for m in table.masked)
@@ -305,21 +314,22 @@ def _rows(path: Path, t: Float[np.ndarray, " time"], rig: Rig) -> Int[np.ndarray
 
 
 def _whole(path: Path, table: Float[np.ndarray, "row column"], rows: Int[np.ndarray, " row"], rig: Rig) -> _Table:
-    """The rows that the file lost, without readings; cut at the first gap of more than `LOST` rows."""
+    """The rows that the file lost, without readings; cut at the first gap where inputs cannot be interpolated."""
     size = int(rows[-1]) + 1
     if size == len(rows):
         return _Table(path, table, rows, [])
-    missing = ~np.isin(np.arange(size), rows)
+    missing, dark = ~np.isin(np.arange(size), rows), np.zeros(size, bool)
     full = np.full((size, table.shape[1]), np.nan)
     full[rows] = table
-    for column in range(1 + len(rig.logged_inputs)):
-        full[:, column] = np.interp(np.arange(size), rows, table[:, column])
-    long = np.flatnonzero((np.diff(rows) > 1 + LOST) & bool(rig.logged_inputs))
-    end = int(rows[long[0]]) + 1 if long.size else size
+    full[:, 0] = np.interp(np.arange(size), rows, table[:, 0])
+    for column in range(1, 1 + len(rig.logged_inputs)):
+        full[:, column], error = interpolated(full[:, column], missing)
+        dark |= error > 0.1  # of the impulse of one row: allowed error of inputs interpolated over a gap
+    end = int(np.argmax(dark)) if dark.any() else size
     used, masked = rows[rows < end], []
     for first, count, kind, hint in (
-        (int(missing.argmax()), int(missing[:end].sum()), "gap", "inputs there are interpolated"),
-        (end, len(rows) - len(used), "cut", "not used; `nnap-em import` makes sequences of what lies between gaps"),
+        (int(missing.argmax()), int(missing[:end].sum()), "gap", "inputs there are interpolated from the rows around"),
+        (end, len(rows) - len(used), "cut", "inputs before these rows cannot be interpolated: not used"),
     ):
         if count:
             k = int(np.searchsorted(rows, first))  # the row of the file after the gap

@@ -4,6 +4,7 @@ A joint that rests repeats a reading as well: only its other column, or where it
 """
 
 import math
+from collections.abc import Collection
 from typing import NamedTuple
 
 import numpy as np
@@ -13,6 +14,7 @@ from .held import Run, runs
 from .noise import reading_noise, resolution
 from .plausible import Columns, bridge
 
+FULL = "saturated"
 SPIKE = 8.0
 """Distance of a spike from its neighbours in robust standard deviations."""
 STILL = 5
@@ -34,8 +36,11 @@ class Rough(NamedTuple):
     rows: Int[np.ndarray, " row"]
 
 
-def rough(readings: Columns, dt: float) -> list[Rough]:
-    """Implausible readings in the columns of one sequence, sampled every `dt` [s]; NaN is a missing sample."""
+def rough(readings: Columns, dt: float, limits: Collection[tuple[str, float]] = ()) -> list[Rough]:
+    """Implausible readings in the columns of one sequence, sampled every `dt` [s]; NaN is a missing sample.
+
+    `limits` are columns and values at which they are known to saturate.
+    """
     entries, left = [], {name: np.array(y) for name, y in readings.items()}
     rates = {name: name[1:] for name in readings if name.startswith("d") and name[1:] in readings}
     for name, y in readings.items():  # a rate from counts may jump by two of them
@@ -45,7 +50,7 @@ def rough(readings: Columns, dt: float) -> list[Rough]:
     for name in sorted(readings, key=lambda name: name in rates):  # coordinates first: rates are held to them
         y = left[name]
         dead = np.isfinite(readings[rates[name]]) & np.isnan(left[rates[name]]) if name in rates else np.zeros(y.size)
-        for kind, rows in _constant(name, left, dt, dead):
+        for kind, rows in _constant(name, left, dt, [value for column, value in limits if column == name], dead):
             entries.append(Rough(kind, name, rows))
             left[name][rows] = np.nan
     return entries
@@ -82,7 +87,9 @@ def spikes(y: Float[np.ndarray, " time"], least: float = 0.0) -> Int[np.ndarray,
     return np.array(out, int)
 
 
-def _constant(name: str, readings: Columns, dt: float, dead: np.ndarray) -> list[tuple[str, Int[np.ndarray, " row"]]]:
+def _constant(
+    name: str, readings: Columns, dt: float, limits: Collection[float], dead: np.ndarray
+) -> list[tuple[str, Int[np.ndarray, " row"]]]:
     """Saturated, stuck and late readings: kinds and rows.  One sensor gives both columns where the other is `dead`."""
     y, found = readings[name], []
     every = runs(y)
@@ -91,19 +98,21 @@ def _constant(name: str, readings: Columns, dt: float, dead: np.ndarray) -> list
         return []
     others = np.sort(lengths)[:-1]  # a sensor that stays stuck would be its own measure
     usual = float(np.median(np.repeat(others, others)))
+    noisy = usual < 2 and np.sum((lengths > 1) & (lengths < STILL)) <= 0.002 * y.size  # more: steps of an encoder
     apart = _disagreement(name, readings, dt)
-    full = np.zeros(y.size, bool)
+    full = np.isin(y, list(limits))
     for limit, sign in ((np.nanmax(y), 1.0), (np.nanmin(y), -1.0)):
         at_limit = [run for run in every if y[run.first] == limit and run.length >= max(3, 2 * usual)]
         if apart is not None and any(_contradicts(y, run, apart, dt, sign) for run in at_limit):
             full |= y == limit
     if full.any():
-        found.append(("saturated", np.flatnonzero(full)))
+        found.append((FULL, np.flatnonzero(full)))
     for run in every:
         if run.length < max(STILL, 3 * usual) or full[run.first]:
             continue
         moved = apart is not None and _contradicts(y, run, apart, dt)
-        if moved or _jumps(y, run) or 2 * np.sum(dead[run.first : run.end]) > run.length:
+        silent = noisy and not (apart and apart.rate) and _silent(y, run)
+        if moved or silent or _jumps(y, run) or 2 * np.sum(dead[run.first : run.end]) > run.length:
             late = run is every[0]
             rows = np.arange(run.first + (not late), run.end)
             found.append(("late start" if late else "stuck", rows[np.isfinite(y[rows])]))
@@ -170,3 +179,15 @@ def _jumps(y: Float[np.ndarray, " time"], run: Run) -> bool:
         return False
     usual, jump = max(np.percentile(step[step > 0], 95), near.max()), abs(after[0] - y[run.first])
     return bool(jump > _MORE * usual and np.min(np.abs(after - y[run.first])) > jump / 2)
+
+
+def _silent(y: Float[np.ndarray, " time"], run: Run) -> bool:
+    """True where the readings around are noise of several steps of the sensor, which the run lacks."""
+    noise, step = reading_noise(y[None]), np.abs(np.diff(y[np.isfinite(y)]))
+    sides = [side[np.isfinite(side)][:_NEAR] for side in (y[: run.first][::-1], y[run.end :])]
+    spread = [(np.std(np.diff(side, 2)), np.std(np.diff(side, 3))) for side in sides if side.size >= 8]
+    noisy = all(bend > noise / 3 and turn > bend for bend, turn in spread)
+    least = max(
+        3 * float(np.min(step[step > 0])), 3e-4 * float(np.nanstd(y))
+    )  # less may be that of a resampled encoder
+    return len(spread) > 0 and noise > least and noisy

@@ -60,7 +60,7 @@ class ParameterPrior(eqx.Module):
 
 
 def declared_prior(parameters: Mapping[str, Declared]) -> ParameterPrior:
-    """That of the parameters that are uncertain."""
+    """The prior of the parameters that are uncertain, as they are declared."""
     free = {name: one for name, one in parameters.items() if one.std > 0}
     mean, std = (jnp.asarray([getattr(one, field) for one in free.values()], float) for field in ("mean", "std"))
     return ParameterPrior(tuple(free), mean, std)

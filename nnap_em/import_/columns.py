@@ -1,4 +1,6 @@
-"""Where columns of a rig stand in a log: as rig.toml declares, or by their names, in the unit that these end in."""
+"""Addresses of the columns of a rig in a log, as rig.toml declares them or by their names, with units and the options
+of `[import]`.
+"""
 
 import math
 import re

@@ -19,9 +19,8 @@ import numpy as np
 
 from nnap_em.data.dataset import pad
 from nnap_em.data.rig import read_rig
-from nnap_em.diagnosis.equations import search_equations
+from nnap_em.diagnosis.diagnose import diagnose
 from nnap_em.diagnosis.keys import Key, key_of, words
-from nnap_em.fit.identify import identify
 from nnap_em.systems import specs
 
 STEPS = 20
@@ -172,7 +171,7 @@ def run(name: str, seed: int, rows: int, log: Callable[[str], None]) -> dict:
     """A search in a simulated log."""
     case, began = CASES[name], time.process_time()
     data = pad([simulate(case, rows, seed)])
-    closed = search_equations(identify(rig_of(PLANTS[case.plant]), data, key=jax.random.key(0)), data, log)
+    closed = diagnose(rig_of(PLANTS[case.plant]), data, key=jax.random.key(0), log=log)
     keys = [key_of(effect) for effect in closed.after.model.effects]
     right = any(is_right(case, key) for key in keys) if case.right else not keys
     seconds = time.process_time() - began

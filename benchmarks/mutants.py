@@ -457,17 +457,14 @@ second differences for third
 # diagnosis/refit.py
 ## test_fit.py::test_a_refit_goes_back_a_third_of_the_way_and_keeps_the_best
 a refit keeps its last model
-- _, core, loglik, hessian, path = best
-+ _, _, loglik, hessian, path = best
+- _, core, path = best
++ _, _, path = best
 a refit judged on sequences that are not used
 - nan=-1e6)[used])
 + nan=-1e6))
 stride of a refit not shortened
-- stride, path = stride / 3, best[4]
-+ stride, path = stride, best[4]
-a refit stated under the rule of its passes
-- hessian + late - early
-+ hessian
+- stride, path = stride / 3, best[2]
++ stride, path = stride, best[2]
 ## test_fit.py::test_a_refit_goes_back_a_third_of_the_way_and_keeps_the_best
 noise of a refit not held
 - count >= NOISE_HELD_PASSES
@@ -746,21 +743,14 @@ the placebo of a constant keeps its meaning
 - moved[:by] *= -1
 + moved[:by] *= 1
 # diagnosis/verdict.py
-## test_verdict.py::test_the_error_falls_on_most_parts_and_rises_on_none_by_much
-a recording may be harmed by any share
-- min(folds) > -HARM * floor
-+ min(folds) < HARM * floor
 ## test_verdict.py::test_the_smaller_share_counts
 the larger of two shares
 - return min(self.inside, self.left_out)
 + return max(self.inside, self.left_out)
-## test_verdict.py::test_a_refit_vetoes_what_is_impossible_uncertain_or_small
+## test_verdict.py::test_a_refit_vetoes_what_is_impossible_or_small
 a refit that removes next to nothing
 - return share >= KEEP * floor
 + return share >= 0
-an amplitude that is not determined
-- if not amplitude > DETERMINED:
-+ if amplitude > DETERMINED:
 ## test_verdict.py::test_a_remainder_comes_before_a_named_law_and_that_before_a_free_one
 free laws before named ones
 - NAMED ** (1 + complexity)
@@ -773,23 +763,20 @@ a suspect within what chance does
 a bump is a ripple
 - if value >= EQUIVALENT * max(values)]
 + if value >= 0.6 * max(values)]
-## test_verdict.py::test_a_law_far_beyond_its_prior_or_within_the_span_of_the_nuisance_is_none
+# diagnosis/screen.py
+## test_search.py::test_a_round[a law that friction can stand for]
 a column of the nuisance is a candidate
-- and survived >= SURVIVES
-+ and survived >= 0
+- return self.survived >= SURVIVES and
++ return
 # diagnosis/context.py
 ## test_search.py::test_the_fit_of_the_least_error_is_kept_the_likelier_of_near_ones_and_none_that_predicts_worse
 a fit that predicts worse is kept
-- a, near) if min(left) <= 1 else None
-+ a, near)
+- if min(left) > 1:
++ if min(left) < 0:
 the worst of two fits is kept
-- if share <= min(left) + LEAST_FALL
-+ if share <= max(left) + LEAST_FALL
-## test_search.py::test_one_fit_is_ahead_of_another_by_what_it_is_likelier_less_a_sixth_at_either_end
-trimmed sum not rescaled
-- cut : gain.size - cut]) * gain.size)
-+ cut : gain.size - cut]) * (gain.size - 2 * cut))
-## test_search.py::test_one_fit_is_ahead_of_another_by_what_it_is_likelier_less_a_sixth_at_either_end
+- return int(np.argmin(left))
++ return int(np.argmax(left))
+## test_search.py::test_one_fit_is_likelier_than_another_where_most_sequences_are
 the fit that is behind wins
 - np.nan_to_num(a, nan=-1e3) - np.nan_to_num(b, nan=-1e3)
 + np.nan_to_num(b, nan=-1e3) - np.nan_to_num(a, nan=-1e3)
@@ -814,51 +801,35 @@ laws of one cause leave the question open
 free suspects before named ones
 - near.sort(key=lambda s: not s.candidate.start.named)
 + near.sort(key=lambda s: s.candidate.start.named)
-# diagnosis/backward.py
-## test_search.py::test_a_law_goes_without_which_too_little_is_lost
+# diagnosis/search.py
+## test_search.py::test_laws_go_without_which_too_little_is_lost_the_least_first
 the most needed law is tried without
 - least = int(np.argmin(lost))
 + least = int(np.argmax(lost))
-## test_search.py::test_what_explains_clearly_more_takes_the_place_of_a_law
-a worse law takes the place of another
-- if ahead > 1:
-+ if ahead < 1:
-# diagnosis/search.py
-## test_search.py::test_a_law_that_is_not_determined_as_it_is_stated_is_a_suspect
+# diagnosis/verdict.py
+## test_verdict.py::test_of_few_recordings_a_standard_deviation_is_hardly_known
 two recordings are as sure as many
 - max(recordings - 1, 1)
 + math.inf
+# diagnosis/rounds.py
 ## test_search.py::test_a_named_law_gives_way_to_a_remainder_that_explains_the_larger_part
 a law stays beside any remainder
 - form is None and 0 in even(
 + form is None and 0 not in even(
+# diagnosis/search.py
 ## test_search.py::test_a_search_keeps_what_was_accepted_before[a matrix is singular in the second round]
 a round that fails loses what was found
-- return hypothesis, state, _told(context, error)
-+ return hypothesis, None, _told(context, error)
-## test_loop.py::test_a_spring_is_named_and_sized_and_other_recordings_compile_nothing
-external disturbances sought in white noise
--     if not white:
--         diagnosis = diagnosis._replace(interventions=_pushed
-+     if white:
-+         diagnosis = diagnosis._replace(interventions=_pushed
-# diagnosis/verdict.py
-## test_search.py::test_the_start_of_a_law_whose_step_removes_most_is_refitted_if_that_is_enough
-a refit without a look
-- needed(share, FORESEEN * required(floor, complexity))
-+ needed(share, 0 * required(floor, complexity))
-the motion of a joint that is not read must follow a law
-- return hidden or needed(share,
-+ return needed(share,
+- yield case
++ yield Progress(case.hypothesis)
 # diagnosis/trial.py
-## test_search.py::test_the_start_of_a_law_whose_step_removes_most_is_refitted_if_that_is_enough
+## test_search.py::test_the_start_of_a_law_whose_step_removes_most_is_refitted
 the worst start of a law
 - return max(begun, key
 + return min(begun, key
 ## test_loop.py::test_a_spring_is_named_and_sized_and_other_recordings_compile_nothing
 what a refit leaves counts as what it removes
-- removed = certainty(form.candidate, effect, cov), 1 - loss.ratio(null.end, end
-+ removed = certainty(form.candidate, effect, cov), loss.ratio(null.end, end
+- removed = 1 - ratio(
++ removed = ratio(
 # diagnosis/rounds.py
 ## test_search.py::test_a_round[another start]
 a law from one start
@@ -874,11 +845,6 @@ a bump is a cogging
 a law of a rate is judged by the coordinates alone
 - every.append((0, (own,)))
 + every.append((0, ()))
-# diagnosis/rounds.py
-## test_search.py::test_a_round[a law that is not refitted]
-laws without a refit fill the shortlist
-- for case in tried if case.refit is not None)
-+ for case in tried)
 # diagnosis/screen.py
 ## test_shares.py::test_recordings_of_one_motion_are_left_out_together
 recordings of one motion are evidence of each other
@@ -888,8 +854,8 @@ recordings of one motion are evidence of each other
 folds interleaved
 - (order * min(MOTION_PARTS, count) // count)
 + (order % min(MOTION_PARTS, count))
-# diagnosis/search.py
-## test_search.py::test_declared_numbers_are_held_where_all_is_read_in_noise_that_is_not_white_and_released_at_the_end
+# diagnosis/diagnose.py
+## test_search.py::test_declared_numbers_are_held_where_all_is_read_and_released_at_the_end
 numbers that were held are held more at the end
 - rule.prior.std / HELD, rule.prior.std
 + rule.prior.std * HELD, rule.prior.std
@@ -897,11 +863,6 @@ numbers that were held are held more at the end
 branches of a hidden angle lost by a search
 - (fit._replace(smoother=CubatureSmoother(fit.bank)) for
 + (fit for
-# diagnosis/backward.py
-## test_search.py::test_rivals_of_a_law_are_its_equivalents_that_the_motion_shows_and_the_law_elsewhere
-a law gives way to one that the motion does not show
-- for c in every if c.start.visible(around)]
-+ for c in every]
 # diagnosis/equations.py
 ## test_equation_laws.py::test_a_strength_that_is_not_determined_is_refused
 a strength of equations that is not determined

@@ -24,8 +24,8 @@ from machines import arm
 
 from nnap_em.data.dataset import Dataset
 from nnap_em.data.rig import Rig, read_rig
+from nnap_em.diagnosis.diagnose import diagnose
 from nnap_em.diagnosis.findings import findings
-from nnap_em.diagnosis.search import diagnose
 from nnap_em.fit.identify import Identified, identify, parameter_table
 from nnap_em.systems import specs
 

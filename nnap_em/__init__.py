@@ -15,9 +15,9 @@ if TYPE_CHECKING:
     from .data.dataset import Dataset, pad
     from .data.logs import read_logs
     from .data.rig import Rig
+    from .diagnosis.diagnose import diagnose
     from .diagnosis.findings import findings
     from .diagnosis.outcome import Diagnosis
-    from .diagnosis.search import diagnose
     from .experiment.experiment import design
     from .fit.check import check
     from .fit.identify import Identified, friction_table, identify, parameter_table
@@ -41,7 +41,7 @@ _homes = {
     "data.rig": "Rig",
     "diagnosis.findings": "findings",
     "diagnosis.outcome": "Diagnosis",
-    "diagnosis.search": "diagnose",
+    "diagnosis.diagnose": "diagnose",
     "experiment.experiment": "design",
     "fit.check": "check",
     "fit.identify": "Identified friction_table identify parameter_table",

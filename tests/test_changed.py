@@ -108,9 +108,8 @@ def test_a_law_that_was_missing_before_is_no_change():
 
 
 def test_a_law_that_the_recordings_of_the_fit_show_as_well_is_no_change():
-    good = {"possible": True, "certainty": 50.0, "amplitude": 50.0, "removed": 0.5, "floor": 0.15, "complexity": 0}
-    assert veto(**good) is veto(**good, before=KEEP * 0.15 - 0.01) is None
-    assert "no change" in veto(**good, before=KEEP * 0.15 + 0.01)
+    assert veto(True, 0.5, 0.15) is veto(True, 0.5, 0.15, KEEP * 0.15 - 0.01) is None
+    assert "no change" in veto(True, 0.5, 0.15, KEEP * 0.15 + 0.01)
 
 
 def test_where_nothing_explains_it_the_errors_decide():

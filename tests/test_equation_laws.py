@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import math
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -14,7 +15,9 @@ from helpers import chain_rig
 from nnap_em.data.dataset import pad
 from nnap_em.data.rig import read_rig
 from nnap_em.diagnosis import equations
-from nnap_em.diagnosis.equations import FOLDS, Case, folds, search_equations
+from nnap_em.diagnosis.equations import FOLDS, Case, by_simulation, folds
+from nnap_em.diagnosis.hypothesis import declared
+from nnap_em.diagnosis.search import Progress, search
 from nnap_em.effects import Candidate, OperatingPoint, SensorEffect, catalogue
 from nnap_em.effects.equations import UnknownTerm
 from nnap_em.em.equations import free_term, motion
@@ -25,6 +28,7 @@ from nnap_em.init.equations import draft_equations
 from nnap_em.model.state_space import Inputs
 from nnap_em.report.document import unknown_terms as reported_terms
 from nnap_em.report.fit_plots import term_figure
+from nnap_em.storage.deadline import TimeUp
 from nnap_em.systems import Equations, specs
 
 PLANT = {
@@ -121,7 +125,7 @@ def test_a_strength_that_is_not_determined_is_refused():
 def test_noise_of_readings_is_no_room_for_laws():
     rng, slow = np.random.default_rng(0), np.sin(np.arange(400) / 20)[None, None, :, None]
     data = _logs(0.0)
-    search = equations.Search(None, data._replace(y=jnp.full_like(data.y, jnp.nan)), print, 0.0)  # type: ignore[arg-type]
+    search = equations.Search(None, data._replace(y=jnp.full_like(data.y, jnp.nan)), print, (), ())  # type: ignore[arg-type]
     for amplitude, room in ((0.0, 0.0), (2.0, 2 / 3)):
         error = rng.standard_normal((1, 1, 400, 1)) + amplitude * slow
         of = _case(1.0, 1, 0.5, error).of
@@ -211,13 +215,18 @@ def test_a_declared_unknown_term_is_part_of_the_model(chain, tmp_path):
     assert [ax.get_xlabel() + ax.get_ylabel() for ax in term_figure(table).axes] == ["b [V]f [V/s]"]
 
 
+def _searched(before, data, end=math.inf):
+    log = lambda text: None  # noqa: E731
+    return search(by_simulation(before, data, log), Progress(declared(before)), before, log, end)
+
+
 @pytest.mark.slow  # fast: test_a_search_that_fails_late_or_is_out_of_time_keeps_what_it_has
 @pytest.mark.parametrize(("coupling", "names"), [(0.25, {("a", ("b",))}), (0.0, set())], ids=["planted", "nothing"])
 def test_a_missing_flow_is_named_and_nothing_where_nothing_is_missing(tmp_path, coupling, names, monkeypatch):
     monkeypatch.setattr(equations, "PARTNERS", 4)  # 6 pairs in place of 120
     data = _logs(coupling)
     before = identify(_rig(tmp_path), data, key=jax.random.key(0))
-    closed = search_equations(before, data, lambda text: None)
+    closed = _searched(before, data)
     assert {(effect.channel, effect.reads) for effect in closed.after.model.effects} == names
 
 
@@ -230,17 +239,17 @@ def test_a_search_that_fails_late_or_is_out_of_time_keeps_what_it_has(chain, mon
 
     def failing(models, *rest, **options):
         if len(models[0].effects) > 1:
-            raise TimeoutError
+            raise TimeUp
         if any(isinstance(effect, SensorEffect) for effect in models[0].effects):
             raise np.linalg.LinAlgError("Singular matrix")
         return whole(models, *rest, **options)
 
     monkeypatch.setattr(equations.simulated, "fit_all", failing)
     monkeypatch.setattr(equations, "free_functions", lambda *_: [])
-    closed = search_equations(before, data, lambda text: None)
+    closed = _searched(before, data)
     assert [(effect.channel, effect.reads) for effect in closed.after.model.effects] == [("a", ("b",))]
     monkeypatch.setattr(equations.simulated, "fit_all", whole)
-    late = search_equations(before, data, lambda text: None, until=0.0)
+    late = _searched(before, data, end=0.0)
     assert (late.complete, late.after.model.effects, len(late.steps)) == (False, (), 1)
 
 

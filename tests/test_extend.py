@@ -6,12 +6,11 @@ from rigs import slide_logs
 
 from nnap_em.diagnosis.context import SearchContext, extend
 from nnap_em.diagnosis.hypothesis import Hypothesis
-from nnap_em.diagnosis.losses import MultiStep
 
 
 def test_friction_that_is_right_is_gone_on_from(slide_fit):
     data, lines = slide_logs(0), []
-    context = SearchContext(slide_fit, {}, data, MultiStep(), lines.append)
+    context = SearchContext(slide_fit, {}, data, lines.append)
     state = extend(context, Hypothesis(slide_fit.model, slide_fit.m_step), data.t.shape[1])
     assert len(lines) == 1
     assert np.nanmean(state.top) == pytest.approx(np.nanmean(slide_fit.state.top), abs=0.5)

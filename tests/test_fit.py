@@ -210,13 +210,10 @@ def test_a_refit_goes_back_a_third_of_the_way_and_keeps_the_best(monkeypatch):
 
     _fake(monkeypatch, refits, locals_along=lambda *_: SimpleNamespace(filtered_from=None), each=smoothed)
     monkeypatch.setattr(ScoringMStep, "advance", advance)
-    trial = refits.refit(MODEL, RULE, PATH, DATA, np.array([True, True, False]), passes=5)
+    model, _ = refits.refit(MODEL, RULE, PATH, DATA, np.array([True, True, False]), passes=5)
     # 3 is worse than 0: a third of it; from 1 on with twice the share, and a third of that
     np.testing.assert_allclose(tried, [0.0, 3.0, 1.0, 3.0, 1.0 + 2 / 3], atol=1e-12)
-    np.testing.assert_allclose(trial.model.log_q, 1.0)
-    np.testing.assert_allclose(trial.loglik, 0.0, atol=1e-9)
-    brief, late = (rule.weights(MODEL).prior_precision(MODEL.unknown) for rule in (RULE.while_growing(), RULE))
-    np.testing.assert_allclose(trial.hessian - late + brief, 1.0, rtol=1e-6)  # stated under the rule that was given
+    np.testing.assert_allclose(model.log_q, 1.0)
     assert strides == [0.0, 0.0, 0.0, 1.5, 1.5]  # the noise is held until the path has found its place
 
 

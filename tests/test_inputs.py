@@ -9,7 +9,6 @@ import pytest
 from nnap_em.data.dataset import Dataset
 from nnap_em.data.rig import Declared, Rig
 from nnap_em.diagnosis.hypothesis import Hypothesis
-from nnap_em.diagnosis.losses import MultiStep
 from nnap_em.diagnosis.propose import proposals, surroundings
 from nnap_em.diagnosis.screen import screen
 from nnap_em.diagnosis.smoothed import SmoothedFit
@@ -66,7 +65,7 @@ def _screened(asked, candidates):
     model, rule, data, path, _ = asked
     data = jax.tree.map(jnp.asarray, data)
     bare = Hypothesis(model, rule)
-    return screen(MultiStep(), SmoothedFit(bare, bare, path, data, np.ones(COUNT, bool), ROWS), candidates)
+    return screen(SmoothedFit(bare.model, bare, path, data, np.ones(COUNT, bool), ROWS), candidates)
 
 
 def _functions(around):

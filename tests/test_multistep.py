@@ -63,7 +63,7 @@ def known() -> SmoothedFit:
     x = _moves(model, jnp.tile(start.mean, (4, 1)), data)
     path = Gaussian(x, jnp.broadcast_to(1e-8 * jnp.eye(2), (*x.shape, 2)))
     bare = Hypothesis(model, problem.mstep)
-    return SmoothedFit(bare, bare, path, data._replace(y=x), np.ones(4, bool), ROWS)
+    return SmoothedFit(bare.model, bare, path, data._replace(y=x), np.ones(4, bool), ROWS)
 
 
 @pytest.fixture(scope="module")

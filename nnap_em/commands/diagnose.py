@@ -17,8 +17,8 @@ import time
 
 import jax
 
+from ..diagnosis.diagnose import diagnose
 from ..diagnosis.findings import findings
-from ..diagnosis.search import diagnose
 from ..fit.store import AFTER_FILE
 from ..report.diagnosis import write_diagnosis
 from ..storage.log import Log

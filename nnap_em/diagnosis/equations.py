@@ -6,7 +6,6 @@ recordings, and judged on these. A linear screen along smoothed paths would favo
 
 import itertools
 import math
-import time
 from collections.abc import Sequence
 from typing import Any, NamedTuple, cast
 
@@ -25,20 +24,20 @@ from ..em.equations import free_term, motion
 from ..em.readings import reading_noise
 from ..fit.identify import Identified, fitted_to_horizon
 from ..model.state_space import with_effects
+from ..storage.deadline import TimeUp, late
 from ..storage.log import Log
-from .hypothesis import Evidence, Hypothesis, covariances, declared
+from .hypothesis import Evidence, Hypothesis, covariances
 from .keys import Key, complexity, key_of, words
-from .outcome import Diagnosis, Step, Suspect
+from .outcome import Step, Suspect
+from .search import Method, Round
 from .trial import certainty
-from .verdict import AGREE, DETERMINED, EQUIVALENT_NATS, MULTI_STEP, PAIR, SUSPECT_SHARE, even, required
+from .verdict import DETERMINED, EQUIVALENT_NATS, MULTI_STEP, NAMED, agreed, even, suspected
 
 FOLDS, BLOCKS = 4, 8
 """Parts that are left out in turn, each of every fourth block of the rows."""
 SHORTLIST, FREE, PARTNERS, PAIRS_JUDGED = 4, 2, 16, 8
 """Laws of one, of two and of three numbers, and free functions, that are judged on parts left out; laws of which pairs
 are tried, and pairs judged."""
-MOST_LAWS = 3
-"""Laws at most, or one more where the last were a pair."""
 MEASURE = "share of the squared error"
 GROWN = 64.0
 """Pace over which sizes of delays and lags are grown: an eighth of a slowest time constant."""
@@ -67,8 +66,7 @@ class Case(NamedTuple):
     @property
     def worth(self) -> float:
         """Share times prior odds."""
-        bars = math.prod(required(1.0, complexity(law.start)) for law in self.laws)
-        return self.share * (PAIR ** (len(self.laws) - 1) / bars)
+        return self.share * NAMED ** (len(self.laws) - 1 + sum(complexity(law.start) for law in self.laws))
 
     @property
     def sound(self) -> bool:
@@ -92,7 +90,9 @@ class Search(NamedTuple):
     before: Identified
     data: Dataset
     log: Log
-    until: float
+    every: Sequence[Candidate]
+    free: Sequence[Candidate]
+    """Laws of the catalogue, and functions without a name."""
     begin: Any = None
     """States at all starts, by the model without further laws."""
     scale: Any = None
@@ -120,10 +120,10 @@ class Search(NamedTuple):
         cases: dict[int, Case] = {}
         for places in groups.values():
             models, priors = ([get(full[i]) for i in places] for get in (lambda h: h.model, lambda h: h.m_step.prior))
-            options |= {"scale": self.scale, "begin": self.begin, "until": self.until}
+            options |= {"scale": self.scale, "begin": self.begin}
             try:
                 fits = simulated.fit_all(models, priors, self.data, **options)
-            except (TimeoutError, np.linalg.LinAlgError):
+            except (TimeUp, np.linalg.LinAlgError):
                 continue
             for i, of in zip(places, fits, strict=True):
                 density = simulated.log_posterior(of, self.scale, of.observed)
@@ -212,55 +212,66 @@ def free_functions(before: Identified, around: SearchScales, data: Dataset) -> l
     return out
 
 
-def search_equations(before: Identified, data: Dataset, log: Log, until: float = math.inf) -> Diagnosis:
-    """Laws that equations lack, added and fitted, one or two at a time, until none passes on parts left out."""
-    hypothesis, own, search = declared(before), len(before.model.effects), Search(before, data, log, until)
-    around, steps, complete = around_of(before, data), [], True
+def by_simulation(before: Identified, data: Dataset, log: Log) -> Method:
+    """The search for laws that equations lack, one or two at a time."""
+    around = around_of(before, data)
     kinds = [kind for kind in catalogue.values() if issubclass(kind, PortEffect | SensorEffect | DriveEffect)]
     every = [candidate for kind in kinds for candidate in kind.candidates(around)]
-    free = free_functions(before, around, data)
-    while complete and len(hypothesis.model.effects) - own < MOST_LAWS:
-        chosen, alike, step = _round(search, hypothesis, every, free)
-        steps, complete = [*steps, step], time.monotonic() <= until
-        if chosen is None:
-            break
-        for law, effect in zip(chosen.laws, chosen.effects, strict=True):
-            record = Evidence(equivalent=alike, share=chosen.share, removed=chosen.share)
-            hypothesis = hypothesis.plus(effect, law, record)
-            log(f"  added {words(key_of(effect))}")
-        lean, effects = chosen.of.model, hypothesis.model.effects
-        effects = tuple(effect.with_numbers(fitted) for effect, fitted in zip(effects, lean.effects, strict=True))
-        model = with_effects(hypothesis.model, effects)
-        hypothesis = hypothesis.refitted(eqx.tree_at(lambda m: m.system, model, lean.system))
-    if len(hypothesis.model.effects) == own:
-        return Diagnosis(before, before, (), tuple(steps), complete=complete)
-    state = before.state._replace(best=hypothesis.model)
-    after = fitted_to_horizon(before._replace(state=state, m_step=hypothesis.m_step), data)
-    return Diagnosis(before, after, hypothesis.evidence, tuple(steps), complete=complete)  # type: ignore[arg-type]
+    search = Search(before, data, log, every, free_functions(before, around, data))
+    rows = int(np.asarray(data.valid).sum(axis=1).max())
+    return Method(
+        [rows],
+        lambda hypothesis, rows: _round(search, hypothesis, rows),
+        lambda hypothesis, _: before.state._replace(best=hypothesis.model),
+        lambda hypothesis: _lost(search, hypothesis),
+        lambda fitted: fitted_to_horizon(fitted, data),
+        BLOCKS,
+    )
 
 
-def _round(
-    search: Search, hypothesis: Hypothesis, every: Sequence[Candidate], free: Sequence[Candidate]
-) -> tuple[Case | None, tuple[Key, ...], Step]:
-    """The laws that pass, if any do, and single ones that explain the same. Pairs, and functions without a name, are
-    tried where no single law removes most of what can be removed.
+def _prepared(search: Search, hypothesis: Hypothesis) -> tuple[Search, Hypothesis, Case | None]:
+    """The search from the states that the hypothesis gives, in the scale of its errors; it without what laws need not
+    have in a fit, and that fitted.
     """
-    system, present = hypothesis.model.system, {key_of(effect) for effect in hypothesis.model.effects}
+    system = hypothesis.model.system
     effects = tuple(effect.lean(system) for effect in hypothesis.model.effects)
     lean = hypothesis.refitted(with_effects(hypothesis.model, effects))
-    fresh = lambda c: key_of(c.start) not in present  # noqa: E731
     begin = simulated.filtered(lean.model, search.data)
     first = simulated.simulated(lean.model, lean.m_step.prior, search.data, begin)
     search = search._replace(begin=begin, scale=simulated.scale_of(first))
-    rows = int(np.asarray(search.data.valid).sum(axis=1).max())
-    nothing = None, (), Step(rows, (), (), None, 0, MEASURE)
-    if not (fits := search.fit(lean, [((), ())])):
+    null = search.fit(lean, [((), ())]).get(0)
+    return search._replace(scale=simulated.scale_of(null.of)) if null else search, lean, null
+
+
+def _lost(search: Search, hypothesis: Hypothesis) -> list[float]:
+    """Share of the squared error on parts left out that goes with each law."""
+    shares = [math.inf if evidence is None else evidence.share for evidence in hypothesis.evidence]
+    laws = [i for i, evidence in enumerate(hypothesis.evidence) if evidence is not None]
+    if len(laws) < 2:  # of one law the round has just said so
+        return shares
+    search, lean, full = _prepared(search, hypothesis)
+    left = lambda one, case: sum(search.left_out(one, [case]).get(0, [math.nan])) if case else math.nan  # noqa: E731
+    whole = left(lean, full)
+    for i in laws:
+        one = lean.without(i)
+        share = 1 - whole / left(one, search.fit(one, [((), ())]).get(0))
+        shares[i] = share if math.isfinite(share) else shares[i]
+    return shares
+
+
+def _round(search: Search, hypothesis: Hypothesis, rows: int) -> Round:
+    """The laws that pass, if any do, and single ones that explain the same. Pairs, and functions without a name, are
+    tried where no single law removes most of what can be removed.
+    """
+    present = {key_of(effect) for effect in hypothesis.model.effects}
+    fresh = lambda c: key_of(c.start) not in present  # noqa: E731
+    search, lean, null = _prepared(search, hypothesis)
+    nothing = Round(Step(rows, (), (), None, MEASURE), complete=not late())
+    if null is None:
         return nothing
-    null = fits[0]
-    search = search._replace(scale=simulated.scale_of(null.of))
     if not (parts := search.left_out(lean, [null])):
         return nothing
-    some, whole, room = [*filter(fresh, every)], search.loss(null.of), search.room(null.of)
+    some, whole, room = [*filter(fresh, search.every)], search.loss(null.of), search.room(null.of)
     search.log(f"{len(some)} candidates; {max(room, 0.0):.0%} of the squared error is not noise of the readings")
     if room < MULTI_STEP:
         return nothing
@@ -268,11 +279,11 @@ def _round(
     short = [case for n in range(1, 4) for case in [c for c in singles if c.numbers == n and c.sound][:SHORTLIST]]
     judged = search.judged(lean, short, parts[0])
     passing, tried = [case for case in judged if _passes(case)], [*judged]
-    if room > max([MULTI_STEP, *(case.share for case in passing)]) / PAIR:  # else no pair, no function could be chosen
+    if room > max([MULTI_STEP, *(case.share for case in passing)]) / NAMED:  # else no pair, no function could be chosen
         both = itertools.combinations(singles[:PARTNERS], 2)
         joined = [((*a.laws, *b.laws), (*a.effects, *b.effects)) for a, b in both]
         pairs = sorted(search.fit(lean, joined, steps=SCREEN_STEPS).values(), key=lambda case: case.loss)
-        functions = search.screened(lean, [*filter(fresh, free)])
+        functions = search.screened(lean, [*filter(fresh, search.free)])
         best = [*[case for case in pairs if case.sound][:PAIRS_JUDGED], *functions[:FREE]]
         tried += search.judged(lean, best, parts[0])
         passing = [case for case in tried if _passes(case)]
@@ -281,20 +292,27 @@ def _round(
         laws = " and ".join(f"{words(key)} ({value})" for key, value in zip(case.keys, values, strict=True))
         search.log(f"  {laws}: {case.share:.0%} of the squared error on parts left out")
     listed = tuple((case.keys[0], 1 - search.loss(case.of) / whole) for case in singles)
-    step = Step(rows, listed, tuple((case.keys[-1], case.share) for case in tried), None, len(some), MEASURE)
+    step = Step(rows, listed, tuple((case.keys[-1], case.share) for case in tried), None, MEASURE)
     best, alike = _chosen(passing)
+    complete = not late()
     if best is None:
-        near = sorted((c for c in judged if c.share > SUSPECT_SHARE and c.sound), key=lambda c: -c.share)
+        near = sorted((c for c in judged if suspected(c.share, MULTI_STEP) and c.sound), key=lambda c: -c.share)
         suspects = tuple(Suspect(case.keys[0], case.share, math.nan) for case in near[:4])
-        return None, (), step._replace(suspects=suspects)
+        return Round(step._replace(suspects=suspects), complete=complete)
     same = tuple(case.keys[0] for case in alike if case is not best and len(case.laws) == 1)
-    return best, same, step._replace(accepted=best.keys[0])
+    for law, effect in zip(best.laws, best.effects, strict=True):
+        record = Evidence(equivalent=same, share=best.share, removed=best.share, candidate=law)
+        hypothesis = hypothesis.plus(effect, law, record)
+        search.log(f"  added {words(key_of(effect))}")
+    fitted, effects = best.of.model, hypothesis.model.effects
+    effects = tuple(effect.with_numbers(of) for effect, of in zip(effects, fitted.effects, strict=True))
+    model = eqx.tree_at(lambda m: m.system, with_effects(hypothesis.model, effects), fitted.system)
+    return Round(step._replace(accepted=best.keys[0]), hypothesis.refitted(model), complete)
 
 
 def _passes(case: Case) -> bool:
     """True where the parts left out confirm that the laws remove a share of the squared error."""
-    agree = sum(gain > 0 for gain in case.folds) >= AGREE * len(case.folds)
-    return case.worth >= MULTI_STEP and agree and case.sound and _certain(case)
+    return case.worth >= MULTI_STEP and agreed(case.folds) and case.sound and _certain(case)
 
 
 def _certain(case: Case) -> bool:

@@ -26,8 +26,6 @@ class Step(NamedTuple):
     """Best of every kind with the share of the squared error that it removes."""
     refitted: tuple[tuple[Key, float], ...]
     accepted: Key | None
-    tried: int
-    """Candidates screened."""
     measure: str = "share of the squared error"
     rivals: tuple[Key, ...] = ()
     """Laws of other causes that explain the same, so that none of them was added."""

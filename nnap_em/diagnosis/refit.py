@@ -4,8 +4,6 @@ Each pass linearises the model about the path, smooths, and takes one M-step.  O
 for another structure, so that a new effect costs seconds.
 """
 
-from typing import NamedTuple
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -14,30 +12,16 @@ from jaxtyping import Array, Bool, Float
 
 from ..data.dataset import Dataset
 from ..em.mstep import Core, ScoringMStep, between
-from ..em.multistep import Followed
 from ..em.quadratic import locals_along
 from ..model.state_space import StateSpaceModel
 from ..numerics.gaussian import Gaussian
 from ..numerics.parallel import each
 from ..smoother.kalman import CUBATURE, kalman_filter, linear_posterior, rts
 from ..smoother.posterior import Posterior
-from ..storage.journal import HERE, step
+from ..storage.journal import step
 
 NOISE_HELD_PASSES = 3
 """Passes with the noise as it is."""
-
-
-class Refit(NamedTuple):
-    """A model after some passes, or before any."""
-
-    model: StateSpaceModel
-    m_step: ScoringMStep
-    path: Gaussian
-    loglik: Float[np.ndarray, " seq"]
-    hessian: Float[Array, "phi phi"]
-    """Posterior precision of network weights and parameters."""
-    along: Followed | None = None
-    """The model along its paths, where multi-step errors finished it."""
 
 
 def _smoothed(common, one) -> tuple[Posterior, Float[Array, "time node obs"], Gaussian]:
@@ -51,7 +35,7 @@ def _smoothed(common, one) -> tuple[Posterior, Float[Array, "time node obs"], Ga
     return posterior, read, jax.tree.map(lambda new, old: jnp.where(known, new, old), posterior.state, path)
 
 
-@step(lambda model, m_step, path, *_, **__: Refit(model, m_step, path, HERE, HERE))
+@step(lambda model, _, path, *__, **___: (model, path))
 def refit(
     model: StateSpaceModel,
     m_step: ScoringMStep,
@@ -60,11 +44,10 @@ def refit(
     used: Bool[np.ndarray, " seq"],
     *,
     passes: int = 8,
-) -> Refit:
-    """`model` after `passes` passes from `path`, fitted to the sequences `used`; the likelihood is of all of them.
-    Passes have the rule of short horizons, its noise ratios held at those of `model`; the outcome, with its precision,
-    is stated under `m_step`. The process and reading noise stay as they are in the first passes, while the path finds
-    its place: they would fit the way there, and their estimates decay slowly.
+) -> tuple[StateSpaceModel, Gaussian]:
+    """`model` and its path after `passes` passes from `path`, fitted to the sequences `used`. Passes have the rule of
+    short horizons, its noise ratios held at those of `model`. The process and reading noise stay as they are in the
+    first passes, while the path finds its place: they would fit the way there, and their estimates decay slowly.
     """
     brief = eqx.tree_at(lambda r: r.log_q_prior, m_step.while_growing(), model.log_q, is_leaf=lambda leaf: leaf is None)
     still = eqx.tree_at(lambda r: r.max_log_step, brief, jnp.zeros_like(brief.max_log_step))
@@ -74,24 +57,22 @@ def refit(
         linear = locals_along(rule.whole(model, core), rule.prior, path, data, CUBATURE)
         common = core.log_q, core.log_r, core.start
         posterior, read, steady = each(_smoothed, common, (linear.filtered_from, path))
-        following, hessian, _ = rule.advance(core, linear, posterior, read, used)
-        return following, steady, posterior.loglik, hessian
+        following, _, _ = rule.advance(core, linear, posterior, read, used)
+        return following, steady, posterior.loglik
 
     best, stride, base, goal = None, 1.0, core, core
     for count in range(passes):
         rule = brief if count >= NOISE_HELD_PASSES else still
-        proposal, smoothed, loglik, hessian = program(rule, core, path)
+        proposal, smoothed, loglik = program(rule, core, path)
         total = float(np.sum(np.nan_to_num(np.asarray(loglik), nan=-1e6)[used]))
         if best is None or total >= best[0] - 0.5:
             if best is None or total > best[0]:
-                best = (total, core, np.asarray(loglik), hessian, smoothed)
+                best = total, core, smoothed
             goal, base, stride = proposal, core, min(1.0, 2 * stride)
             path = smoothed
         else:
-            stride, path = stride / 3, best[4]
+            stride, path = stride / 3, best[2]
         core = between(base, goal, stride)
     assert best is not None
-    _, core, loglik, hessian, path = best
-    fitted = m_step.whole(model, core)
-    early, late = (rule.weights(fitted).prior_precision(fitted.unknown) for rule in (brief, m_step))
-    return Refit(fitted, m_step, path, loglik, hessian + late - early)
+    _, core, path = best
+    return m_step.whole(model, core), path

@@ -1,57 +1,88 @@
 """One screening round: all candidates are screened, and the best are refitted until one is accepted."""
 
 import functools
+import math
 from collections.abc import Callable, Iterable, Sequence
-from typing import NamedTuple, TypeVar
+from typing import TypeVar, cast
 
 import jax
 import numpy as np
 
 from ..effects import AbstractEffect
+from ..em.multistep import followed
 from ..model.state_space import StateSpaceModel
 from ..numerics.digits import share_of
 from ..storage.deadline import TimeUp
 from ..systems import AbstractSystem
-from .context import SearchContext
-from .keys import Key, completed, complexity, contains, elsewhere, key_of, replaced, words
+from .context import SearchContext, smooth
+from .hypothesis import Evidence, Hypothesis
+from .keys import Key, completed, complexity, contains, elsewhere, key_of, remainder_of, replaced, words
+from .losses import MEASURE, ratio
 from .outcome import Step, Suspect
 from .propose import proposals, seeded, surroundings
 from .screen import Screened, screen
-from .smoothed import SmoothedFit
-from .trial import Trial, explained, null_of, with_candidate
-from .verdict import EQUIVALENT, NAMED, even, odds, simplest, suspected
+from .search import Round
+from .smoothed import SmoothedFit, extended
+from .trial import Trial, null_of, with_candidate
+from .verdict import EQUIVALENT, NAMED, SURVIVES, even, odds, simplest, suspected
 
 _Law = TypeVar("_Law", Screened, Trial)
 SHORTLIST = 8
 """Candidates that are refitted at most."""
 
 
-class Round(NamedTuple):
-    """Outcome of a screening round."""
-
-    step: Step
-    accepted: Trial | None
-    equivalent: tuple[Key, ...] = ()
-    """Named laws that the data cannot distinguish from the accepted one."""
-    complete: bool = True
-    """False where the time was up before all was refitted."""
-
-
-def screening_round(fit: SmoothedFit, context: SearchContext) -> Round:
-    """Screen everything that the machine may have, and refit the best until one is accepted."""
+def screening_round(context: SearchContext, hypothesis: Hypothesis, length: int) -> Round:
+    """Screen everything that the machine may have over `length` rows, and refit the best until one is accepted."""
+    if length < context.longest:
+        hypothesis = hypothesis.refitted(cast(StateSpaceModel, context.stages[length][0].best))
+    fit, whole = smooth(context, hypothesis, length)
+    reach = f"{length * context.before.rig.dt:.2f} s"
+    context.log(f"{MEASURE}, horizon {reach}: {whole.sum()} of {whole.size} sequences followed")
+    step = Step(int(np.max(np.sum(np.asarray(fit.data.valid), axis=1))), (), (), None, MEASURE)
+    if not fit.used.any():
+        return Round(step)
     around = surroundings(context.before.rig, fit.model, fit.data, fit.path, fit.rows, change=context.change)
-    seen = screen(context.loss, fit, proposals(around, fit.model.effects))
-    fresh = [s for s in seen if s.candidate.start.visible(around) and _fresh(s.candidate.start, fit)]
-    length = int(np.max(np.sum(np.asarray(fit.data.valid), axis=1)))
-    null = functools.cache(lambda: null_of(fit.hypothesis, fit, context.loss))
+    seen = screen(fit, proposals(around, fit.model.effects))
+    fresh = [s for s in seen if s.candidate.start.visible(around) and _fresh(s.candidate.start, hypothesis)]
+    null = functools.cache(lambda: null_of(fit))
 
     def refitted(forms: Sequence[Screened]) -> Trial:
-        case = with_candidate(forms, null(), fit, context.loss)
-        case = case if case.rejection else case._replace(before=explained(case, context))
+        case = with_candidate(forms, null(), fit)
+        case = case if case.rejection else case._replace(before=explained(case, context.origin))
         _log(case, context)
         return case
 
-    return decided(fresh, refitted, Step(length, (), (), None, len(seen), context.loss.measure), fit.model, context)
+    step, best, complete = decided(fresh, refitted, step, fit.model, context)
+    return Round(step, best and joined(hypothesis, *best, context), complete)
+
+
+def explained(case: Trial, fit: SmoothedFit | None) -> float:
+    """Share of the squared error on the recordings of an earlier fit that a law removes; -inf without them."""
+    if fit is None:
+        return -np.inf
+    full = fit.hypothesis.plus(case.effect, case.candidate)
+    null = followed(fit.model, fit.m_step.prior, fit.path, fit.data)
+    other = followed(full.model, full.m_step.prior, extended(full.model, fit.path, fit.data), fit.data)
+    return 1 - ratio(null, other, fit.used, case.screened.band)
+
+
+def joined(hypothesis: Hypothesis, case: Trial, equivalent: tuple[Key, ...], context: SearchContext) -> Hypothesis:
+    """The hypothesis with a refitted law; a named law gives way to a remainder unless it explains most of both."""
+    context.log(f"  added {words(key_of(case.effect))}")
+    screened, share = case.screened, case.screened.share
+    parts = sum(part > 0 for part in share.folds), len(share.folds)
+    remainder, form = remainder_of(case.effect, hypothesis.model), replaced(case.effect, hypothesis.model)
+    place = remainder if form is None else form
+    law = None if place is None else hypothesis.evidence[place]
+    both = case.removed if law is None else 1 - (1 - law.removed) * (1 - case.removed)
+    stays = law is None or (form is None and 0 in even([law.removed, both]))
+    removed = case.removed if stays else both  # over the model without the older law
+    found = Evidence(math.nan, equivalent, share.left_out, screened.chance, parts, removed, case.candidate)
+    following = case.after._replace(evidence=(*case.after.evidence[:-1], found))
+    if stays or form is not None:  # its place is taken already
+        return following
+    context.log(f"  {words(key_of(hypothesis.model.effects[cast(int, remainder)]))} is a part of it, and is removed")
+    return following.without(cast(int, remainder))
 
 
 def decided(
@@ -60,28 +91,28 @@ def decided(
     step: Step,
     model: StateSpaceModel,
     context: SearchContext,
-) -> Round:
-    """The best laws of a screen, `refitted` from their starts that explain as much, until one is accepted."""
+) -> tuple[Step, tuple[Trial, tuple[Key, ...]] | None, bool]:
+    """The best laws of a screen, `refitted` from their starts that explain as much, until one is accepted: the round,
+    that law with those that the data cannot distinguish from it, and False where the time was up before.
+    """
     ranked = best_of_kind(s for s in fresh if seeded(s.candidate, s.coefficients).is_physical())
     step = step._replace(screened=tuple((key_of(s.candidate.start), s.listed) for s in ranked))
     admitted = [s for s in ranked if s.reached]
     tried: list[Trial] = []
     complete = True
     try:
-        while admitted and (left := SHORTLIST - len(_removals(tried))) > 0:
+        while admitted and (left := SHORTLIST - len(tried)) > 0:
             group = _group(admitted, model)[:left]
             cases = [refitted(_forms(s, fresh)) for s in group]
             tried += cases
-            admissible = [case for case in cases if case.rejection is None]
-            if admissible:
-                return _accepted(admissible, Round(step._replace(refitted=_removals(tried)), None), model, context)
+            if admissible := [case for case in cases if case.rejection is None]:
+                return *_accepted(admissible, step._replace(refitted=_removals(tried)), model, context), True
             admitted = [s for s in admitted if not any(s is other for other in group)]
     except TimeUp:
         complete = False
     judged = {key_of(case.candidate.start) for case in tried}
     suspects = _suspects([s for s in ranked if key_of(s.candidate.start) not in judged])
-    step = step._replace(refitted=_removals(tried), suspects=suspects, untried=len(admitted))
-    return Round(step, None, complete=complete)
+    return step._replace(refitted=_removals(tried), suspects=suspects, untried=len(admitted)), None, complete
 
 
 def _group(admitted: Sequence[Screened], model: StateSpaceModel) -> list[Screened]:
@@ -100,7 +131,9 @@ def _group(admitted: Sequence[Screened], model: StateSpaceModel) -> list[Screene
     return list({id(s): s for s in group}.values())
 
 
-def _accepted(admissible: list[Trial], outcome: Round, model: StateSpaceModel, context: SearchContext) -> Round:
+def _accepted(
+    admissible: list[Trial], step: Step, model: StateSpaceModel, context: SearchContext
+) -> tuple[Step, tuple[Trial, tuple[Key, ...]] | None]:
     """Choose among refitted laws: the simplest at the place that is worth most, in its simplest form. None where one
     that is worth as much is of another cause, nor a free function where no error rose since a fit.
     """
@@ -114,13 +147,13 @@ def _accepted(admissible: list[Trial], outcome: Round, model: StateSpaceModel, c
     if rivals:
         keys = tuple(key_of(case.effect) for case in (best, *rivals))
         context.log(f"  cannot tell: {', '.join(map(words, keys))} explain the same; none is added")
-        return outcome._replace(step=outcome.step._replace(rivals=keys))
+        return step._replace(rivals=keys), None
     if not (law.named or context.functions):
         context.log(f"  {words(key_of(law))} is no change: errors have not risen since the fit")
-        return outcome._replace(step=outcome.step._replace(suspects=_suspects([best.screened])))
+        return step._replace(suspects=_suspects([best.screened])), None
     same = [key_of(case.effect) for case in tied if case.effect.named]
     equivalent = tuple(key for key in dict.fromkeys(same) if key != key_of(law))
-    return Round(outcome.step._replace(accepted=key_of(best.effect)), best, equivalent)
+    return step._replace(accepted=key_of(best.effect)), (best, equivalent)
 
 
 def _complexities(laws: Sequence[_Law], model: StateSpaceModel) -> list[int]:
@@ -150,13 +183,13 @@ def other_cause(one: AbstractEffect, best: AbstractEffect, system: AbstractSyste
     return not same_law and bool(of_best and of_one) and of_best.isdisjoint(of_one)
 
 
-def _fresh(law: AbstractEffect, fit: SmoothedFit) -> bool:
+def _fresh(law: AbstractEffect, hypothesis: Hypothesis) -> bool:
     """True for a law that is new or takes the place of one, and for a change of a law of an earlier fit in its form."""
-    model, pairs = fit.model, list(zip(fit.model.effects, fit.hypothesis.evidence, strict=True))
-    present = {key_of(effect) for effect, evidence in pairs if evidence is not None}
+    model, found = hypothesis.model, hypothesis.evidence
+    present = {key_of(effect) for effect, evidence in zip(model.effects, found, strict=True) if evidence is not None}
     place = replaced(law, model)
-    new = place is None and key_of(law) not in present
-    return (new or (place is not None and pairs[place][1] is not None)) and not completed(law, model)
+    new = key_of(law) not in present if place is None else found[place] is not None
+    return new and not completed(law, model)
 
 
 def best_of_kind(every: Iterable[Screened]) -> list[Screened]:
@@ -174,7 +207,8 @@ def _forms(law: Screened, every: Sequence[Screened]) -> list[Screened]:
     shape = jax.tree.structure(law.candidate.start)
     same = [s for s in every if s.band == law.band and jax.tree.structure(s.candidate.start) == shape]
     near = [s for s in same if s.share.least >= EQUIVALENT * law.share.least]
-    return [s for s in near if s is law or (s.sound and seeded(s.candidate, s.coefficients).is_physical())]
+    sound = lambda s: s.survived >= SURVIVES and seeded(s.candidate, s.coefficients).is_physical()  # noqa: E731
+    return [s for s in near if s is law or sound(s)]
 
 
 def _log(case: Trial, context: SearchContext) -> None:
@@ -182,19 +216,15 @@ def _log(case: Trial, context: SearchContext) -> None:
     removed = (case.screened.share.least, case.foreseen, case.removed)
     screened, step, after = (share_of(share, "the squared error", 1) for share in removed)
     name, bar = words(key_of(case.effect)), f"bar {case.screened.bar:.1%}"
-    text = f"{name} {values}: {screened} by the linear screen, {step} along its step"
-    if case.refit is None:
-        context.log(f"  {text}; {bar}; not refitted")
-        return
-    context.log(f"  refitted {text}, {after} after it; {bar}")
+    text = f"{screened} by the linear screen, {step} along its step, {after} after it; {bar}"
+    context.log(f"  refitted {name} {values}: {text}")
     if reason := case.rejection:
         context.log(f"  {name} {reason}")
 
 
 def _removals(tried: Sequence[Trial]) -> tuple[tuple[Key, float], ...]:
     """Shares that laws remove after their refit, the best first."""
-    shares = ((key_of(case.effect), case.removed) for case in tried if case.refit is not None)
-    return tuple(sorted(shares, key=lambda entry: -entry[1]))
+    return tuple(sorted(((key_of(case.effect), case.removed) for case in tried), key=lambda entry: -entry[1]))
 
 
 def _suspects(ranked: Sequence[Screened]) -> tuple[Suspect, ...]:

@@ -5,6 +5,7 @@ only strengths are fitted without the parts left out.  Refits on every fold dive
 """
 
 import itertools
+import math
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
@@ -21,9 +22,9 @@ from ..numerics.gaussian import Gaussian
 from ..storage.journal import HERE, step
 from .columns import blocks_of
 from .keys import complexity
-from .losses import Linearised, MultiStep
+from .losses import BANDS, Linearised, linearise
 from .smoothed import SmoothedFit
-from .verdict import CHANCE, MULTI_STEP, REPEATS, Share, agreed, required, sensible
+from .verdict import CHANCE, MULTI_STEP, REPEATS, SURVIVES, Share, agreed, required
 
 SHIFTS = 2
 """Placebos whose largest share is the chance level."""
@@ -54,7 +55,6 @@ class Shares(NamedTuple):
     folds: Float[np.ndarray, "candidate fold"]
     coefficients: Float[np.ndarray, " probe"]
     survived: Float[np.ndarray, " candidate"]
-    far: Float[np.ndarray, " candidate"]
 
 
 class Screened(NamedTuple):
@@ -69,9 +69,7 @@ class Screened(NamedTuple):
     chance: float
     """Smallest share that counts at that band, and largest of any placebo that the parts left out confirm."""
     survived: float = 1.0
-    far: float = 0.0
-    """Norm of its columns that friction and parameters cannot give, over their norm [0 to 1]; distance of a linear law
-    from none, in root mean square of the standard deviations of its prior."""
+    """Norm of its columns that friction and parameters cannot give, over their norm [0 to 1]."""
 
     @property
     def ratio(self) -> float:
@@ -95,18 +93,14 @@ class Screened(NamedTuple):
 
     @property
     def admissible(self) -> bool:
-        """True where the parts left out confirm the share."""
-        return self.sound and agreed(self.share.folds, self.floor, responds=self.candidate.start.responds_to_feedback())
+        """True where the parts left out confirm the share, for which friction and parameters cannot stand."""
+        responds = self.candidate.start.responds_to_feedback()
+        return self.survived >= SURVIVES and agreed(self.share.folds, self.floor, responds=responds)
 
     @property
     def listed(self) -> float:
         """Share as a report lists it; 0 where the parts disagree."""
         return self.share.least if self.admissible else 0.0
-
-    @property
-    def sound(self) -> bool:
-        """True for strengths that a fit may reach and that friction and parameters cannot stand for."""
-        return sensible(float(self.coefficients[0]), self.far, self.survived, linear=self.candidate.start.linear)
 
 
 def motions(state: Float[np.ndarray, "seq time state"], used: Bool[np.ndarray, " seq"]) -> Int[np.ndarray, " seq"]:
@@ -274,8 +268,7 @@ def shares(rows: Rows, candidates: Sequence[Candidate], timed: Sequence[bool]) -
         moments = sum(sums.left_out(block == b) for b in np.unique(block))
         least = np.where(np.asarray(timed)[indices], np.inf, moments)
         left_out[indices] = np.minimum(out.sum(axis=1), least) / total
-    far = np.array([np.sqrt(np.mean(coefficients[span] ** 2 * r)) for span, r in zip(where, ridge, strict=True)])
-    return Shares(inside, left_out, folds, coefficients, survived, far)
+    return Shares(inside, left_out, folds, coefficients, survived)
 
 
 def _ridge(candidate: Candidate) -> Float[np.ndarray, " probe"]:
@@ -287,38 +280,36 @@ def _ridge(candidate: Candidate) -> Float[np.ndarray, " probe"]:
     return np.array([np.sum(((probe - start) / spread) ** 2) for probe in probes])
 
 
-@step(lambda loss, _, __, shifts: ((Shares(*6 * [HERE]),) * (1 + shifts),) * len(loss.bands))
-def _bands(
-    loss: MultiStep, fit: SmoothedFit, candidates: Sequence[Candidate], shifts: int
-) -> tuple[tuple[Shares, ...], ...]:
+@step(lambda *_: ((Shares(*5 * [HERE]),) * (1 + SHIFTS),) * len(BANDS))
+def _bands(fit: SmoothedFit, candidates: Sequence[Candidate]) -> tuple[tuple[Shares, ...], ...]:
     """Shares of the candidates and of each placebo, by band; the same data give the same placebos."""
     blocks, out = blocks_of(candidates), []
     prior = friction_prior(fit.model, fit.m_step.weights(fit.model))
-    for some, bands in zip(blocks, loss.linearise(fit, blocks), strict=True):
-        out.append([_band(fit, some, *prior, linearised, shifts) for linearised in bands])
+    for some, bands in zip(blocks, linearise(fit, blocks), strict=True):
+        out.append([_band(fit, some, *prior, linearised) for linearised in bands])
     return tuple(jax.tree.map(lambda *some: np.concatenate(some), *band) for band in zip(*out, strict=True))
 
 
-def _band(fit: SmoothedFit, candidates, precision, pull, linearised: Linearised, shifts: int) -> tuple[Shares, ...]:
-    count, timed = 1 + shifts, ["time" in c.start.signals(fit.model.system) for c in candidates]
+def _band(fit: SmoothedFit, candidates, precision, pull, linearised: Linearised) -> tuple[Shares, ...]:
+    count, timed = 1 + SHIFTS, ["time" in c.start.signals(fit.model.system) for c in candidates]
     fold, block = parts(fit.model, fit.path, fit.data, fit.used, linearised.rows)
     rng, size = np.random.default_rng(0), spans(candidates)[-1].stop
     linearised = linearised._replace(columns=linearised.columns[..., : len(pull) + size])
-    moved = [shifted(linearised, len(pull), rng).columns[..., len(pull) :] for _ in range(shifts)]
+    moved = [shifted(linearised, len(pull), rng).columns[..., len(pull) :] for _ in range(SHIFTS)]
     columns = np.concatenate([linearised.columns, *moved], axis=-1)
     rows = project(linearised._replace(columns=columns), fold, block, precision, pull)
     every = shares(rows, [*candidates] * count, timed * count)
     return tuple(Shares(*some) for some in zip(*(np.split(a, count) for a in every), strict=True))
 
 
-def screen(
-    loss: MultiStep, fit: SmoothedFit, candidates: Sequence[Candidate], shifts: int = SHIFTS
-) -> tuple[Screened, ...]:
+def screen(fit: SmoothedFit, candidates: Sequence[Candidate]) -> tuple[Screened, ...]:
     """Every candidate at the first band of horizons that shows it, else at that of the largest multiple of its bar.
     Bands are in the order of what they prove: errors soon after a start show more of what else a model lacks.
     """
-    out, floor = [], MULTI_STEP / loss.remaining_share(fit)
-    for number, (real, *moved) in enumerate(_bands(loss, fit, candidates, shifts)):
+    # a later law must remove the floor of the first error, not of what earlier ones left of it
+    removed = [evidence.removed for evidence in fit.hypothesis.evidence if evidence is not None]
+    out, floor = [], MULTI_STEP / math.prod(1 - share for share in removed if math.isfinite(share))
+    for number, (real, *moved) in enumerate(_bands(fit, candidates)):
         placebos = [s for one in moved for s in _screened(one, candidates, number, floor, 0.0)]
         chance = max([0.0, *(s.listed for s in placebos)])
         out.append(_screened(real, candidates, number, floor, chance))
@@ -330,5 +321,4 @@ def _screened(
 ) -> Iterator[Screened]:
     for i, (candidate, span) in enumerate(zip(candidates, spans(candidates), strict=True)):
         share = Share(float(shares.inside[i]), float(shares.left_out[i]), tuple(shares.folds[i].tolist()))
-        numbers = band, floor, chance, float(shares.survived[i]), float(shares.far[i])
-        yield Screened(candidate, shares.coefficients[span], share, *numbers)
+        yield Screened(candidate, shares.coefficients[span], share, band, floor, chance, float(shares.survived[i]))

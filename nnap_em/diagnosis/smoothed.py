@@ -22,16 +22,16 @@ from .hypothesis import Hypothesis, declared
 
 
 class SmoothedFit(NamedTuple):
-    """A fitted hypothesis beside the declared one, and its smoothed paths, over all rows or their beginning."""
+    """A fitted hypothesis beside the model without its laws, and its smoothed paths."""
 
-    declared: Hypothesis
+    declared: StateSpaceModel
     hypothesis: Hypothesis
     path: Gaussian
     data: Dataset
     used: Bool[np.ndarray, " seq"]
     """Sequences that the smoother follows."""
     rows: int
-    """Rows of the whole recording, of which `data` may be a part."""
+    """Rows of the longest recording, of which `data` may be a part."""
 
     @property
     def model(self) -> StateSpaceModel:
@@ -48,7 +48,7 @@ def along(fitted: Identified, data: Dataset, smoother: AbstractSmoother) -> Smoo
     """A fit as it is along some recordings."""
     hypothesis, posterior = declared(fitted), e_step(fitted.model, data, smoother, key=fitted.state.key)
     used = np.asarray(not_diverged(posterior, data))
-    return SmoothedFit(hypothesis, hypothesis, posterior.state, data, used, data.t.shape[1])
+    return SmoothedFit(fitted.model, hypothesis, posterior.state, data, used, data.t.shape[1])
 
 
 def risen_since(own: SmoothedFit, now: SmoothedFit) -> Risen:

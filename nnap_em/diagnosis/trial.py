@@ -3,22 +3,28 @@
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from ..effects import AbstractEffect, Candidate, flat
+from ..em.multistep import Followed, finish
 from ..numerics.gaussian import Gaussian
-from .context import SearchContext
-from .findings import estimates
-from .hypothesis import Hypothesis, covariances
+from .hypothesis import Hypothesis
 from .keys import complexity, replaced
-from .losses import MultiStep
+from .losses import ratio
 from .propose import seeded
-from .refit import Refit, refit
+from .refit import refit
 from .screen import Screened
 from .smoothed import SmoothedFit, extended
-from .verdict import foreseen, veto
+from .verdict import required, veto
+
+
+class Fitted(NamedTuple):
+    """A hypothesis after Gauss-Newton steps on the multi-step errors about a path."""
+
+    hypothesis: Hypothesis
+    path: Gaussian
+    along: Followed
 
 
 class Trial(NamedTuple):
@@ -26,15 +32,10 @@ class Trial(NamedTuple):
 
     screened: Screened
     after: Hypothesis
-    removed: float
-    """Share of the squared error that it removes, at the horizons by which its band is judged."""
-    certainty: float
-    amplitude: float
-    """Wald statistics [standard deviations] of its strengths, jointly, and of its reported amplitude, inf without."""
-    foreseen: float = np.nan
-    """Share that the step of the screen removes, before any pass."""
-    refit: Refit | None = None
-    """Its fit; None where the step of the screen removed too little for one."""
+    foreseen: float
+    removed: float = np.nan
+    """Shares of the squared error of the refitted hypothesis without it, at the horizons by which its band is judged,
+    that the step of the screen removes, and its refit."""
     before: float = -np.inf
     """Share of the squared error that it removes from the recordings of the fit from which the search began."""
 
@@ -51,75 +52,50 @@ class Trial(NamedTuple):
     @property
     def rejection(self) -> str | None:
         """Reason against it; None where there is none."""
-        numbers = {name: getattr(self, name) for name in ("certainty", "amplitude", "removed", "before")}
-        possible, count = self.effect.is_physical(), complexity(self.effect)
-        return veto(possible=possible, floor=self.screened.floor, complexity=count, **numbers)
+        least = required(self.screened.floor, complexity(self.effect))
+        return veto(self.effect.is_physical(), self.removed, least, self.before)
 
 
-class Null(NamedTuple):
-    """A hypothesis before and after its passes, with which trials are compared."""
-
-    start: Refit
-    end: Refit
-
-
-def begun(hypothesis: Hypothesis, path: Gaussian, fit: SmoothedFit, loss: MultiStep) -> Refit:
-    """`hypothesis` before any pass, finished on the data of the loss along a path."""
-    return loss.finish(fit, Refit(hypothesis.model, hypothesis.m_step, path, np.zeros(0), jnp.zeros((0, 0))))
+def begun(hypothesis: Hypothesis, path: Gaussian, fit: SmoothedFit) -> Fitted:
+    """`hypothesis` before any pass, on the data of `fit` along a path."""
+    along = finish(hypothesis.model, hypothesis.m_step, path, fit.data, fit.used)
+    return Fitted(hypothesis.refitted(along.model), path, along)
 
 
-def fitted(start: Refit, fit: SmoothedFit, loss: MultiStep) -> Refit:
-    """A refit after some passes from where it was begun, finished again."""
-    return loss.finish(fit, refit(start.model, start.m_step, start.path, fit.data, fit.used))
+def fitted(start: Fitted, fit: SmoothedFit) -> Fitted:
+    """The same after some passes, and finished again."""
+    hypothesis = start.hypothesis
+    model, path = refit(hypothesis.model, hypothesis.m_step, start.path, fit.data, fit.used)
+    return begun(hypothesis.refitted(model), path, fit)
 
 
-def null_of(hypothesis: Hypothesis, fit: SmoothedFit, loss: MultiStep) -> Null:
-    """`hypothesis` along the paths of `fit`, before its passes and after them."""
-    start = begun(hypothesis, fit.path, fit, loss)
-    return Null(start, fitted(start, fit, loss))
+def null_of(fit: SmoothedFit) -> Fitted:
+    """The hypothesis of `fit`, refitted as trials are, with which they are compared."""
+    return fitted(begun(fit.hypothesis, fit.path, fit), fit)
 
 
-def leader(begun: Iterable[tuple[Trial, Refit]]) -> tuple[Trial, Refit]:
+def leader(begun: Iterable[tuple[Trial, Fitted]]) -> tuple[Trial, Fitted]:
     """The start of a law whose step removes most; those that are not physical come last."""
     return max(begun, key=lambda each: (each[0].effect.is_physical(), each[0].foreseen))
 
 
-def with_candidate(forms: Sequence[Screened], null: Null, fit: SmoothedFit, loss: MultiStep) -> Trial:
+def with_candidate(forms: Sequence[Screened], null: Fitted, fit: SmoothedFit) -> Trial:
     """A law in the model, or in the place of the law that it is another form of, refitted from the one of its `forms`
     whose step removes most and is physical: on the linear screen a friction of three periods may explain what five do.
-    Not refitted where the nonlinear error hardly falls along that step (`foreseen`).
     """
     hypothesis = fit.hypothesis
 
-    def stepped(form: Screened) -> tuple[Trial, Refit]:
+    def stepped(form: Screened) -> tuple[Trial, Fitted]:
         effect = seeded(form.candidate, form.coefficients)
         place = replaced(effect, hypothesis.model)
         full = (hypothesis if place is None else hypothesis.without(place)).plus(effect, form.candidate)
-        start = begun(full, extended(full.model, fit.path, fit.data), fit, loss)
-        share = 1 - loss.ratio(null.start, start, fit, form.band)
-        return Trial(form, full.refitted(start.model), share, np.inf, np.inf, share), start
+        start = begun(full, extended(full.model, fit.path, fit.data), fit)
+        return Trial(form, start.hypothesis, 1 - ratio(null.along, start.along, fit.used, form.band)), start
 
     trial, start = leader(map(stepped, forms))
-    form = trial.screened
-    if not foreseen(trial.foreseen, form.floor, complexity(form.candidate.start), hidden=hypothesis.model.hides):
-        return trial
-    end = fitted(start, fit, loss)
-    trial = trial._replace(after=trial.after.refitted(end.model), refit=end)
-    effect, cov = trial.effect, covariances(trial.after.model, trial.after.m_step, end.hessian)[-1]
-    reported = estimates(effect, cov, trial.after.model.system).get("amplitude")
-    amplitude = reported.value / reported.std if reported and reported.std > 0 else np.inf
-    sure, removed = certainty(form.candidate, effect, cov), 1 - loss.ratio(null.end, end, fit, form.band)
-    return trial._replace(removed=removed, certainty=sure, amplitude=amplitude)
-
-
-def explained(case: Trial, context: SearchContext) -> float:
-    """Share of the squared error on the recordings of an earlier fit that a law removes; -inf without them."""
-    if (fit := context.origin) is None:
-        return -np.inf
-    full, loss = fit.hypothesis.plus(case.effect, case.candidate), context.loss
-    null = loss.along(fit, fit.hypothesis, fit.path)
-    other = loss.along(fit, full, extended(full.model, fit.path, fit.data))
-    return 1 - loss.ratio(null, other, fit, case.screened.band)
+    end = fitted(start, fit)
+    removed = 1 - ratio(null.along, end.along, fit.used, trial.screened.band)
+    return trial._replace(after=end.hypothesis, removed=removed)
 
 
 def certainty(candidate: Candidate, effect: AbstractEffect, cov: Float[np.ndarray, "param param"]) -> float:

@@ -7,7 +7,6 @@ as its signals move. [Ljung 1999, "System Identification", 2nd ed., chapter 7; M
 """
 
 import math
-import time
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -22,6 +21,7 @@ from ..model.base import prepare
 from ..model.state_space import StateSpaceModel
 from ..numerics.parallel import each
 from ..smoother.kalman import TANGENT, ekf
+from ..storage.deadline import in_time
 from .multistep import FARTHEST, huber
 from .prior import ParameterPrior
 
@@ -257,12 +257,6 @@ def fit(
     return fit_all([model], [prior], data, begin=begin, scale=scale)[0]
 
 
-def in_time(until: float) -> None:
-    """Raise TimeoutError after `until` [s, of time.monotonic]."""
-    if time.monotonic() > until:
-        raise TimeoutError
-
-
 def fit_all(
     models: Sequence[StateSpaceModel],
     priors: Sequence[ParameterPrior],
@@ -272,20 +266,19 @@ def fit_all(
     scale: Scale,
     counts: Counts | None = None,
     steps: int = 40,
-    until: float = math.inf,
 ) -> list[Simulated]:
     """Models of one structure with the parameters of the largest `log_posterior`, side by side; their noise stays.
 
-    `counts` are the errors that count.  Raises TimeoutError where `until` [s, of time.monotonic] is over first.
+    `counts` are the errors that count.  Raises TimeUp where a deadline (`storage/deadline.py`) is over first.
     """
-    in_time(until)
+    in_time()
     best = together(models, priors, [np.zeros_like(begin.mean)] * len(models), data, begin)
     known = best[0].observed & (True if counts is None else counts)
     values = [log_posterior(one, scale, known) for one in best]
     damping, open_ = [1e-2] * len(best), list(range(len(best)))
     falls = 0.01  # gain in the log of the posterior [nat] below which a fit ends
     for _ in range(steps):
-        in_time(until)
+        in_time()
         ahead, moved = [], []
         for i in open_:
             step, start = _normal(best[i], scale, known).solved(damping[i])

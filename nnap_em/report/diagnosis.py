@@ -8,12 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..data.logs import Logs
+from ..diagnosis.diagnose import unbranched
 from ..diagnosis.findings import Finding, advice, changes, entry, suspected, undecided, verdict
 from ..diagnosis.interventions import Intervention
 from ..diagnosis.keys import Key, key_of, place_of, words
 from ..diagnosis.outcome import Diagnosis, Step
 from ..diagnosis.residual import Names, Residual, names_of, residual
-from ..diagnosis.search import unbranched
 from ..diagnosis.statistics import tests
 from ..fit.identify import FrictionTable, friction_table
 from ..fit.misfit import moved

@@ -25,8 +25,13 @@ def until(moment: float) -> Iterator[None]:
         _end.reset(token)
 
 
-def in_time() -> None:
-    """Raises TimeUp where the deadline has passed in any process."""
+def late() -> bool:
+    """True where the deadline has passed in any process."""
     end = _end.get()
-    if end < math.inf and not everywhere(time.monotonic() < end):
+    return end < math.inf and not everywhere(time.monotonic() < end)
+
+
+def in_time() -> None:
+    """Raises TimeUp where the deadline has passed."""
+    if late():
         raise TimeUp("the time is up")

@@ -17,7 +17,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Bool, Float
 from scipy.linalg import orth
 from scipy.optimize import least_squares
 from scipy.signal import savgol_coeffs
@@ -25,6 +25,7 @@ from scipy.signal import savgol_coeffs
 from ..data.dataset import Dataset
 from ..data.noise import reading_noise
 from ..data.rig import HOLD, SMOOTH, Rig
+from ..em.prior import ParameterPrior, declared_prior
 from ..em.servos import build_servos
 from ..model import hooks
 from ..systems import AbstractSystem
@@ -113,9 +114,8 @@ class Regression(NamedTuple):
 
     system: AbstractSystem
     motion: Motion
-    mean: dict[str, Array]
+    prior: ParameterPrior
     """Uncertain numbers of the machine."""
-    std: Float[np.ndarray, " param"]
     least: Float[np.ndarray, " param"]
     """Smallest changes of these numbers [std]."""
     rows: Bool[np.ndarray, "piece time"]
@@ -138,18 +138,21 @@ class Regression(NamedTuple):
 
     def parts(
         self,
+        moved: np.ndarray | float = 0.0,
+        *,
         sign: np.ndarray | float = 1.0,
         shift: np.ndarray | float = 0.0,
         gravity: np.ndarray | float = 1.0,
-        *,
         slopes: bool = False,
     ) -> Float[np.ndarray, "part row dof *param"]:
-        """Torques of inertia, velocities and gravity, or their slopes by the mean: q is sign (reading - shift), and
-        of every joint's gravity a share counts.
+        """Torques of inertia, velocities and gravity with numbers so many std from their mean, or the slopes by them.
+
+        The coordinates are sign (reading - shift), and of every joint's gravity a share counts.
         """
-        motion, share = self.motion, jnp.asarray(gravity * np.ones(len(self.system.coordinates)))
+        motion, share = self.motion, gravity * np.ones(len(self.system.coordinates))
+        moved = moved * np.ones(self.prior.size)
         rows = ((sign * part).reshape(-1, len(share)) for part in (motion.q - shift, motion.v, motion.a))
-        parts = np.asarray(_torques(self.system, self.mean, share, *map(jnp.asarray, rows), slopes=slopes))
+        parts = np.asarray(_torques(self.system, self.prior, *map(jnp.asarray, (moved, share, *rows)), slopes=slopes))
         inertia, *others = np.moveaxis(parts.reshape(*motion.q.shape[:2], *parts.shape[1:]), 2, 0)
         both = [filtered(inertia, motion.inertial), *(_by_joint(part, motion.direct) for part in others)]
         return np.stack(both)[:, self.rows]
@@ -158,18 +161,13 @@ class Regression(NamedTuple):
         """Share of the squared torque that stays unexplained, by joint, with other inputs or changes of `parts`."""
         applied = self.applied(self.inputs if inputs is None else inputs)
 
-        def needed(moved: np.ndarray, slopes: bool = False) -> np.ndarray:
-            values = zip(self.mean.items(), moved * self.std, strict=True)
-            there = self._replace(mean={name: mean + step for (name, mean), step in values})
-            return there.parts(**change, slopes=slopes).sum(axis=0)
-
         def error(moved: np.ndarray) -> np.ndarray:
-            return self.beyond(needed(moved) - applied).ravel()
+            return self.beyond(self.parts(moved, **change).sum(axis=0) - applied).ravel()
 
         def slopes(moved: np.ndarray) -> np.ndarray:
-            return self.beyond(needed(moved, slopes=True)).reshape(-1, len(moved)) * self.std
+            return self.beyond(self.parts(moved, **change, slopes=True).sum(axis=0)).reshape(-1, len(moved))
 
-        moved = np.zeros_like(self.std)
+        moved = np.zeros(self.prior.size)
         if len(moved):
             moved = least_squares(error, moved, slopes, (self.least, WITHIN), max_nfev=PASSES).x
         return np.mean(error(moved).reshape(applied.shape) ** 2, axis=0)
@@ -250,21 +248,19 @@ def regression(rig: Rig, system: AbstractSystem, data: Dataset) -> Regression | 
         return None
     held = not_identifiable(rig, system, data)
     uncertain = {name: of for name, of in rig.parameters.items() if of.std and name in rig.bodies and name not in held}
-    mean, std = {n: jnp.asarray(of.mean, float) for n, of in uncertain.items()}, [of.std for of in uncertain.values()]
+    prior = declared_prior(uncertain)
     positive = [of.mean > 0 and ("." not in n or n.endswith(("mass", "armature"))) for n, of in uncertain.items()]
-    both = zip(uncertain.values(), positive, strict=True)
-    least = np.asarray([max(-WITHIN, -of.mean / of.std) if above else -WITHIN for of, above in both])
+    least = np.where(positive, np.maximum(-WITHIN, -prior.mean / prior.std), -WITHIN)
     inputs = _by_joint(motion.torque, motion.direct[[joint - 1 for joint in system.joints]])
     maps = [filtered(_hats(motion.v[..., j]), taps) for j, taps in enumerate(motion.direct)]
     full = np.ones(inputs.shape[:2], bool)
-    problem = Regression(system, motion, mean, np.asarray(std), least, full, inputs, [], inputs)
+    problem = Regression(system, motion, prior, least, full, inputs, [], inputs)
     plain = problem.parts().reshape(3, *full.shape, -1)
     rows = np.all([np.isfinite(part).all(axis=-1) for part in (*plain, inputs, *maps)], axis=0)
     if rows.sum() < FILTERED_ROWS:
         return None
-    return problem._replace(
-        rows=rows, inputs=inputs[rows], friction=[_directions(one[rows]) for one in maps], plain=plain[:, rows]
-    )
+    friction = [_directions(one[rows]) for one in maps]
+    return problem._replace(rows=rows, inputs=inputs[rows], friction=friction, plain=plain[:, rows])
 
 
 def explanations(rig: Rig, problem: Regression) -> Iterator[Explanation]:
@@ -313,19 +309,16 @@ def lag(problem: Regression, i: int) -> Lag:
     The best whole number of rows, then one step of Gauss and Newton.
     """
     joint, motion, torque = problem.driven[i], problem.motion, problem.motion.torque[..., i]
-    others = problem.parts(slopes=True).sum(axis=0)[:, joint] * problem.std
-    rest = problem.plain.sum(axis=0)[:, joint] - (problem.applied(problem.inputs)[:, joint] - problem.inputs[:, i])
+    free = np.concatenate([problem.friction[joint], problem.parts(slopes=True).sum(axis=0)[:, joint]], axis=1)
     far = np.pad(torque, ((0, 0), (REACH, REACH)), constant_values=np.nan)
     shifts = range(-REACH, REACH + 1)
     late = [filtered(far[:, REACH - k :][:, : torque.shape[1]], motion.direct[joint])[problem.rows] for k in shifts]
     inside = np.isfinite(late).all(axis=0)
     if inside.sum() < FILTERED_ROWS:
         return Lag(0.0, math.inf, 1.0)
-    late, rest = np.stack(late)[:, inside], rest[inside]
-    free = _directions(np.concatenate([problem.friction[joint], others], axis=1)[inside])
-    misfits = [rest - torque for torque in late]
-    misfits = [error - free @ (free.T @ error) for error in misfits]
-    best = 1 + int(np.argmin([float(error @ error) for error in misfits[1:-1]]))
+    misfits, free = (problem.plain.sum(axis=0)[:, joint] - late)[:, inside], _directions(free[inside])
+    misfits -= (misfits @ free) @ free.T
+    best = 1 + int(np.argmin(np.sum(misfits[1:-1] ** 2, axis=1)))
     moved = 0.5 * (misfits[best - 1] - misfits[best + 1])
     size = float(moved @ moved) + 1e-300
     rows = float(moved @ misfits[best]) / size
@@ -390,16 +383,15 @@ def mistakes(found: Iterable[Explanation], plain: Float[np.ndarray, " dof"]) -> 
 
 
 @eqx.filter_jit
-def _torques(system: AbstractSystem, mean: dict[str, Array], share, q, v, a, *, slopes: bool):
-    """Torques of inertia, velocities and gravity by row, or their slopes by the numbers of `mean`."""
+def _torques(system: AbstractSystem, prior: ParameterPrior, moved, share, q, v, a, *, slopes: bool):
+    """Torques of inertia, velocities and gravity by row, or their slopes by numbers that are so far from their mean."""
 
-    def torques(values, q, v, a):
-        machine = system.with_parameters(dict(zip(mean, values, strict=True))) if mean else system
+    def torques(moved, q, v, a):
+        machine = prior.write(system, moved)
         gravity = machine.bias(q, jnp.zeros_like(v))
         return jnp.stack([machine.mass(q) @ a, machine.bias(q, v) - gravity, share * gravity])
 
-    values = jnp.stack(list(mean.values())) if mean else jnp.zeros(0)
-    return jax.vmap(jax.jacfwd(torques) if slopes else torques, (None, 0, 0, 0))(values, q, v, a)
+    return jax.vmap(jax.jacfwd(torques) if slopes else torques, (None, 0, 0, 0))(moved, q, v, a)
 
 
 def filtered(x: Float[np.ndarray, "piece time *any"], taps: Float[np.ndarray, " tap"]) -> np.ndarray:

@@ -94,9 +94,10 @@ def check(
     if results[0].mark == ERROR:
         return results
     try:
-        for name, part in (("train", train), ("test", test)) if rig.equations else ():
-            if part is not None and (text := infinite_rates(rig, build_system(rig), part)):
-                return [*results, CheckResult(ERROR, "rates", f"{name}: {text}")]
+        parts = [("train", train), ("test", test)] if rig.equations else []
+        infinite = [(name, infinite_rates(rig, build_system(rig), part)) for name, part in parts if part is not None]
+        if broken := [CheckResult(ERROR, "rates", f"{name}: {text}") for name, text in infinite if text]:
+            return [*results, *broken]
         problem = begin(rig, data, key=key)
     except RigError:
         return [CheckResult(ERROR, "bodies", f"{NO_MACHINE}: look at their signs and units"), *results]
@@ -108,7 +109,7 @@ def check(
         return [*results, CheckResult(ERROR, "servo", f"{text}: look at the units of its gains, or sample faster")]
     scales = measure_scales(rig, system, data)
     model = eqx.tree_at(lambda m: m.unknown, problem.model, NoFriction(jnp.asarray(0.1 * scales.torque)))
-    head = _first(data, max(round(SECONDS / rig.dt), FEWEST_SAMPLES))
+    head = _first(data, max(round(SECONDS / rig.dt), FEWEST_SAMPLES) + 1)
     along = Along(*(np.asarray(part) for part in each(_along, (model, problem.smoother, problem.state.key), head)))
     return [
         *results,
@@ -117,7 +118,7 @@ def check(
         *torques(rig, system, data, scales),
         *dynamics(rig, system, data),
         *_motion(rig, model, data, along),
-        *_observability(model, along, np.asarray(head.valid)),
+        *_observability(model, along, np.asarray(head.valid)[:, :-1]),
     ]
 
 
@@ -234,10 +235,9 @@ def _noise(rig: Rig, model: StateSpaceModel, data: Dataset) -> Iterator[CheckRes
         seen = reading_noise(signal)
         noisy = max(seen, declared or 0.0) > 0.3 * _std(signal)
         alone = name not in model.system.sensors  # of three axes one may sense nothing
-        ratio, text = 1.0, f"about {seen:.2g} {unit}, not declared, so it is estimated"
-        if declared:
-            ratio = seen / declared
-            text = f"declared {declared:.2g} {unit}, the log's high frequencies show {seen:.2g} {unit}"
+        ratio = seen / declared if declared else 1.0
+        said = f"declared {declared:.2g} {unit}" if declared else "not declared, so it is estimated"
+        text = f"{seen:.2g} {unit} by the log's high frequencies, {said}"
         hints = {
             "declare more, or leave it out to have it estimated": (ratio > 3, ratio > 30),
             "the motion hardly rises above it: move or excite more, or look at the units": (noisy, noisy and alone),
@@ -341,12 +341,11 @@ def _needed(
 
     A joint that bears nothing at zero may bear much elsewhere.  Joints that nobody reads are anywhere in a turn.
     """
-    read = [(i, rig.measured.index(name)) for i, name in enumerate(system.coordinates) if name in rig.measured]
-    seen = np.asarray(data.y)[..., [column for _, column in read]][np.asarray(data.valid)]
+    read = {i: rig.measured.index(name) for i, name in enumerate(system.coordinates) if name in rig.measured}
+    seen = np.asarray(data.y)[..., [*read.values()]][np.asarray(data.valid)]
     seen = seen[np.isfinite(seen).all(axis=1)]
-    seen = seen[np.linspace(0, len(seen) - 1, POSES).astype(int)] if len(seen) else np.zeros((POSES, len(read)))
     q = np.where(system.angles, np.random.default_rng(0).uniform(-np.pi, np.pi, (POSES, len(system.angles))), 0.0)
-    q[:, [joint for joint, _ in read]] = seen
+    q[:, [*read]] = seen[np.linspace(0, len(seen) - 1, POSES).astype(int)] if len(seen) else 0.0
     mass, gravity = map(np.asarray, _loads(system, jnp.asarray(q)))
     return np.percentile(np.abs(gravity), 99, axis=0) + np.mean(mass, axis=0) * acceleration
 

@@ -55,7 +55,7 @@ def identifiability(rig: Rig, system: AbstractSystem, servos: tuple[Servo, ...] 
     if servos and rig.friction:
         labels += [f"the learned friction of joint {1 + i // _POWERS}" for i in range(friction.shape[1])]
         scaled += [*(friction / np.linalg.norm(friction, axis=0)).T]
-    free = null_space(np.stack(scaled, axis=1), rcond=SHARE_LEFT)
+    free = np.asarray(null_space(np.stack(scaled, axis=1), rcond=SHARE_LEFT))
     shared = np.abs(free @ free.T) > SHARE_LEFT
     groups = connected_components(shared)[1]
     together = [np.flatnonzero(groups == group) for group in dict.fromkeys(groups[np.diag(shared)])]
@@ -82,7 +82,7 @@ def _columns(
     def driven(system, servos, q, v, u):
         if not servos:
             return jnp.zeros_like(q)
-        fed = jnp.stack([servo.fed(u[i][None], hooks.Sampling(1.0).through)[0] for i, servo in enumerate(servos)])
+        (fed,) = hooks.fed((), servos, system, u[None], hooks.Sampling(1.0))
         return system.drive(hooks.driven((), servos, system, fed, q, v))
 
     def force(values, a):

@@ -195,11 +195,9 @@ def motion_along(rig: Rig, system: AbstractSystem, data: Dataset) -> Motion | No
     if not seen or rig.scale_columns or not {*rig.kinds.values()} <= {"torque", "voltage"}:
         return None
     fed = np.asarray(data.u, float)[..., : len(system.joints)]
-    still = fed == 0
+    still, sampled = fed == 0, hooks.Sampling(rig.dt, rig.input_hold == SMOOTH)
     if servos:
-        through = hooks.Sampling(rig.dt, rig.input_hold == SMOOTH).through
-        each = jax.vmap(lambda u: jnp.stack([of.fed(u[:, i], through) for i, of in enumerate(servos)], axis=-1))
-        fed = np.asarray(each(jnp.asarray(fed)))
+        fed = jax.vmap(lambda u: hooks.fed((), servos, system, u, sampled))(jnp.asarray(fed))
     y, u, still = (_pieces(np.asarray(part, float), valid) for part in (data.y, fed, still))
     value, slope, bend = (savgol_coeffs(WIDTH, ORDER, deriv, rig.dt, use="dot") for deriv in range(3))
     # an acceleration is the mean of the true one with a window, of readings of the position or of the rate
@@ -231,12 +229,13 @@ def motion_along(rig: Rig, system: AbstractSystem, data: Dataset) -> Motion | No
     edge = WIDTH // 2
     both = (filtered(part, np.array(TRIANGLE[rig.input_hold])) for part in (u, still))
     torque, still = (np.pad(part, ((0, 0), (1, 1), (0, 0)), constant_values=np.nan)[:, edge:-edge] for part in both)
-    gears, braking = np.asarray(system.gears), np.zeros_like(torque)
-    for i, servo in enumerate(servos):
-        fed = torque[..., i], 0.0 * torque[..., i]
-        own = [jnp.asarray([gears[i] * x[..., system.joints[i] - 1]] * 2) for x in (q, v)]
-        torque[..., i], unfed = np.asarray(jnp.vectorize(servo.torque)(jnp.asarray(fed), *own))
-        braking[..., i] = np.where(still[..., i] > 0, still[..., i] * unfed, 0.0) * (servo.kind == "voltage")
+    braking = np.zeros_like(torque)
+    if servos:
+        driven = jax.vmap(jax.vmap(lambda u, q, v: hooks.driven((), servos, system, u, q, v)))
+        torque, unfed = (np.asarray(driven(*map(jnp.asarray, (u, q, v)))) for u in (torque, braking))
+        volts = np.array([servo.kind == "voltage" for servo in servos])
+        braking = np.where((still > 0) & volts, still * unfed, 0.0)
+    gears = np.asarray(system.gears)
     direct = np.stack([np.convolve(low, window) for *_, window in sources])
     return Motion(q, v, a, torque * gears, braking * gears, np.pad(low, edge), direct)
 
@@ -425,4 +424,4 @@ def _hats(v: Float[np.ndarray, "piece time"]) -> Float[np.ndarray, "piece time n
 
 def _directions(columns: Float[np.ndarray, "row column"]) -> Float[np.ndarray, "row direction"]:
     """Orthonormal directions of the columns, without those that the log hardly has."""
-    return orth(columns / (np.linalg.norm(columns, axis=0) + 1e-300), rcond=1e-4)
+    return np.asarray(orth(columns / (np.linalg.norm(columns, axis=0) + 1e-300), rcond=1e-4))

@@ -205,7 +205,9 @@ def test_a_held_reading_is_said_and_its_repeats_are_no_lost_samples(slide):
     report = _report(replace(slide, data=data, masked=masked))
     assert report["missing"] == [("ok", f"{name}: 0 % of the samples are missing") for name in ("x", "dx")]
     assert [mark for mark, _ in report["held"]] == ["warning", "warning"] and "rough" not in report
-    assert report["held"][0][1].startswith(f"x: each reading stands in 9.57 rows, in {COUNT} of {COUNT} files")
+    assert report["held"][0][1].startswith(
+        f"x: held: 1080 in {COUNT} of {COUNT} files, most in 000.csv; each reading stands in 9.57 rows"
+    )
 
 
 def test_the_command_prints_a_line_per_question_and_fails_where_one_is_bad(tmp_path, capsys):

@@ -1,6 +1,6 @@
 """Test of whether logs can identify what is declared, before EM: one line per subject, ok, warning or error."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import equinox as eqx
@@ -90,74 +90,65 @@ def check(
     """
     train, test = logs_of_arrays(train, rig), None if test is None else logs_of_arrays(test, rig)
     data = Dataset(*(np.asarray(part) for part in train.data))
-    amount = [*_amount(rig, data, test), *_readings(train, rig), *rates(rig, data)]
-    if amount[0].mark == ERROR:
-        return amount
+    results = [*_amount(rig, data, test), *_readings(rig, train), *rates(rig, data)]
+    if results[0].mark == ERROR:
+        return results
     try:
-        if rig.equations:
-            parts = (("train", train), ("test", test))
-            logs = [(name, infinite_rates(rig, build_system(rig), part)) for name, part in parts if part is not None]
-            if broken := [CheckResult(ERROR, "rates", f"{name}: {text}") for name, text in logs if text]:
-                return [*amount, *broken]
+        parts = [("train", train), ("test", test)] if rig.equations else []
+        infinite = [(name, infinite_rates(rig, build_system(rig), part)) for name, part in parts if part is not None]
+        if broken := [CheckResult(ERROR, "rates", f"{name}: {text}") for name, text in infinite if text]:
+            return [*results, *broken]
         problem = begin(rig, data, key=key)
     except RigError:
-        return [CheckResult(ERROR, "bodies", f"{NO_MACHINE}: look at their signs and units"), *amount]
+        return [CheckResult(ERROR, "bodies", f"{NO_MACHINE}: look at their signs and units"), *results]
     system = problem.model.system
     if rig.equations:
-        return [*amount, *_equations(rig, problem, data)]
-    if stiff := list(_stiff(rig, system, data)):
-        return [*amount, *stiff]
+        return [*results, *_equations(rig, problem, data)]
+    if (steps := steps_of_sample(system, build_servos(rig), data, rig.dt)) > MOST_STEPS:
+        text = f"the stiffest servo would need {steps:.0f} integration steps of a sample, and gets {MOST_STEPS}"
+        return [*results, CheckResult(ERROR, "servo", f"{text}: look at the units of its gains, or sample faster")]
     scales = measure_scales(rig, system, data)
     model = eqx.tree_at(lambda m: m.unknown, problem.model, NoFriction(jnp.asarray(0.1 * scales.torque)))
-    rows = min(data.valid.shape[1], _window(rig.dt) + 1)
-    head = _first(data, rows)
+    head = _first(data, max(round(SECONDS / rig.dt), FEWEST_SAMPLES) + 1)
     along = Along(*(np.asarray(part) for part in each(_along, (model, problem.smoother, problem.state.key), head)))
     return [
-        *amount,
+        *results,
         *_sampling(rig, along, scales),
         *_noise(rig, model, data),
         *torques(rig, system, data, scales),
         *dynamics(rig, system, data),
         *_motion(rig, model, data, along),
-        *_observability(model, along, np.asarray(head.valid)),
+        *_observability(model, along, np.asarray(head.valid)[:, :-1]),
     ]
-
-
-def _window(dt: float) -> int:
-    """Rows that are smoothed with the first model."""
-    return max(round(SECONDS / dt), FEWEST_SAMPLES)
 
 
 def _equations(rig: Rig, problem: Identified, data: Dataset) -> Iterator[CheckResult]:
     """Modes of equations against rows and recordings, noise, and observability of their states over whole logs."""
     model, longest = problem.model, float(data.valid.sum(axis=1).max()) * rig.dt
     seen = motion(model, data)
-    fastest, growing = 1 / max(seen.fastest, 1e-12), 1 / seen.growth if seen.growth else np.inf
+    fastest, brief = 1 / max(seen.fastest, 1e-12), longest < RECORDED * seen.slowest < np.inf
     text = f"rows {rig.dt:g} s apart, time constants of the declared equations {fastest:.3g} to {seen.slowest:.3g} s"
     text += f"; integrators: {', '.join(seen.kept)}" if seen.kept else ""
-    grown = f"; unstable: deviations of {', '.join(seen.unstable)} grow at {seen.growth:.3g} 1/s"
-    text += f"{grown if seen.growth else ''}; predictions are judged up to {model.pace:g} s ahead"
-    errors = {
-        "no states follow the readings: look at signs, units and parameters": not len(seen.rate),
-        "errors grow too fast between two rows: sample faster, or look at units and signs": growing < 2 * rig.dt,
+    text += f"; unstable: {', '.join(seen.unstable)}, at {seen.growth:.3g} 1/s" if seen.growth else ""
+    lost, wild = not len(seen.rate), seen.growth * 2 * rig.dt > 1
+    hints = {
+        "no states follow the readings: look at signs, units and parameters": (lost, lost),
+        "errors grow too fast between two rows: sample faster, or look at units and signs": (wild, wild),
+        "the fastest is over between two rows: sample faster, or look at the units of parameters": (fastest < rig.dt,),
+        f"record {RECORDED:g} of the slowest at least, here {longest:.3g} s": (brief,),
     }
-    brief = longest < RECORDED * seen.slowest < np.inf
-    warnings = {
-        "the fastest is over between two rows: sample faster, or look at the units of parameters": fastest < rig.dt,
-        f"record {RECORDED:g} of the slowest at least, here {longest:.3g} s": brief,
-    }
-    yield _result("sampling", text, errors, warnings)
+    yield _row("sampling", f"{text}; predictions are judged up to {model.pace:g} s ahead", hints)
     yield from _noise(rig, model, data)
     at = windows(model, data)  # a start that nothing shows, as at rest, is one of many
     place = at.rows * np.arange(at.count)[:, None] + np.arange(at.rows)
     cut = lambda part: np.asarray(part)[:, place].reshape(-1, at.rows, *part.shape[2:])  # noqa: E731
     along = Along(*map(cut, each(filter_path, model, jax.device_put(data))))
-    yield from _observability(model, along, cut(data.valid), at.rows)
+    yield from _observability(model, along, cut(data.valid))
 
 
 def _first(data: Dataset, rows: int) -> Dataset:
     """The first rows of some sequences, from shortly before they move on."""
-    at = onset(np.asarray(data.y))[:SEQUENCES, None] + np.arange(rows)
+    at = onset(np.asarray(data.y))[:SEQUENCES, None] + np.arange(min(rows, data.t.shape[1]))
     inside, at = at < data.t.shape[1], np.minimum(at, data.t.shape[1] - 1)
     head = Dataset(*(part[np.arange(len(at))[:, None], at] for part in data))
     return head._replace(valid=head.valid & inside)
@@ -178,55 +169,50 @@ def _std(values: np.ndarray) -> float:
     return float(finite.std()) if finite.size else 0.0
 
 
-def _result(subject: str, text: str, errors: Mapping[str, object], warnings: Mapping[str, object]) -> CheckResult:
-    """A result with the hints of those errors and warnings that hold."""
-    mark = ERROR if any(errors.values()) else WARNING if any(warnings.values()) else OK
-    hints = dict.fromkeys(hint for hint, holds in (*errors.items(), *warnings.items()) if holds)
-    return CheckResult(mark, subject, "; ".join(part for part in (text, *hints) if part))
+def _row(subject: str, text: str, hints: Mapping[str, Sequence[object]]) -> CheckResult:
+    """A result with its hints, of which each has one or two conditions: that of a warning, that of an error."""
+    levels = {hint: sum(map(bool, holds)) for hint, holds in hints.items()}
+    mark = (OK, WARNING, ERROR)[max(levels.values(), default=0)]
+    return CheckResult(mark, subject, "; ".join(filter(None, (text, *(hint for hint in levels if levels[hint])))))
 
 
 def _amount(rig: Rig, data: Dataset, test: Logs | None) -> Iterator[CheckResult]:
     rows = data.valid.sum(axis=1)
-    few = rows.sum() < 100 or rows.max() < 20
-    warnings = {
-        "more would make the result surer": rows.sum() < 1000 and not few,
-        f"the shortest is {rows.min() * rig.dt:.2g} s: leave out what is under 60 rows": rows.min() < 60,
-        "cut them into sequences of some seconds": rows.max() > max(_LONG[0] / rig.dt, _LONG[1]) and not rig.equations,
+    few, long = rows.sum() < 100 or rows.max() < 20, rows.max() > max(_LONG[0] / rig.dt, _LONG[1])
+    hints = {
+        "too few; record some minutes": (few or rows.sum() < 1000, few),
+        f"the shortest is {rows.min() * rig.dt:.2g} s: leave out what is under 60 rows": (rows.min() < 60,),
+        "cut them into sequences of some seconds": (long and not rig.equations,),
     }
     text = f"{counted(len(rows), 'training sequence')}, {rows.sum() * rig.dt:.3g} s, {rows.sum()} rows"
-    yield _result("length", text, {"too few; record some minutes": few}, warnings)
-    if test is None:
-        yield CheckResult(WARNING, "test", "no test sequences: no prediction error will be reported")
-    else:
-        yield CheckResult(OK, "test", f"{counted(len(test.files), 'test sequence')}, none of them in train")
+    yield _row("length", text, hints)
+    text = f"{counted(len(test.files) if test else 0, 'test sequence')}, none of them in train"
+    yield _row("test", text, {"no prediction error will be reported": (test is None,)})
 
 
-def _readings(train: Logs, rig: Rig) -> Iterator[CheckResult]:
-    """Missing samples of each column, the rows in which each reading stands, and what was masked on reading."""
-    rows, repeated, rough = np.asarray(train.data.valid).sum(axis=1), {}, {}
+def _readings(rig: Rig, train: Logs) -> Iterator[CheckResult]:
+    """Missing samples of each column, and what was masked on reading."""
+    read, rows = np.isfinite(train.data.y).sum(axis=1), np.asarray(train.data.valid).sum(axis=1)
+    gone, masked = np.asarray(rows[:, None] - read), {}
     for entry in train.masked:
+        masked.setdefault((entry.kind, entry.column), []).append(entry)
         if entry.kind == REPEAT:
-            repeated[entry.column, entry.file] = entry.amount
-        else:
-            rough.setdefault((entry.kind, entry.column), []).append(entry)
-    for name, y in zip(rig.measured, np.moveaxis(np.asarray(train.data.y), -1, 0), strict=True):
-        read, again = np.isfinite(y).sum(axis=1), np.array([repeated.get((name, file), 0) for file in train.files])
-        gone = rows - read - again
-        share = gone.sum() / rows.sum()
+            gone[train.files.index(entry.file), rig.measured.index(entry.column)] -= entry.amount
+    for name, lost in zip(rig.measured, gone.T, strict=True):
+        share = lost.sum() / rows.sum()
         text = f"{name}: {100 * share:.0f} % of the samples are missing"
-        text += f", most in {train.files[int(np.argmax(gone / rows))]}" if share else ""
-        yield _result("missing", text, {"": share > 0.75}, {"": share > 0.2})
-        if files := np.count_nonzero(again):
-            stands = 1 + again.sum() / read[again > 0].sum()
-            text = f"{name}: each reading stands in {stands:.3g} rows, in {files} of {counted(len(again), 'file')}; "
-            text += f"all but the first are missing samples: {stands * rig.dt:.3g} s lie between two readings"
-            yield CheckResult(WARNING, "held", text)
-    for (kind, column), entries in rough.items():
-        count = sum(entry.amount for entry in entries)
-        text = f"{column}: {kind}: " if column else f"{kind}: "
-        text += f"{counted(count, 'reading' if column else 'row')} in {len({entry.file for entry in entries})} of "
-        text += f"{counted(len(train.files), 'file')}, most in {max(entries, key=lambda entry: entry.amount).file}"
-        yield CheckResult(ERROR if count > 0.3 * rows.sum() else WARNING, "rough", text)
+        text += f", most in {train.files[int(np.argmax(lost / rows))]}" if share else ""
+        yield _row("missing", text, {"": (share > 0.2, share > 0.75)})
+    for (kind, column), entries in masked.items():
+        count, files = sum(entry.amount for entry in entries), {entry.file for entry in entries}
+        text = f"{column or 'rows'}: {kind}: {count} in {len(files)} of {counted(len(rows), 'file')}, "
+        text += f"most in {max(entries, key=lambda entry: entry.amount).file}"
+        subject, much = "rough", count > 0.3 * rows.sum()
+        if kind == REPEAT:
+            kept = read[[train.files.index(file) for file in files], rig.measured.index(column)].sum()
+            subject, much = "held", False
+            text += f"; each reading stands in {1 + count / kept:.3g} rows, all but the first are missing samples"
+        yield _row(subject, text, {"": (True, much)})
 
 
 def _sampling(rig: Rig, along: Along, scales: Scales) -> Iterator[CheckResult]:
@@ -238,8 +224,8 @@ def _sampling(rig: Rig, along: Along, scales: Scales) -> Iterator[CheckResult]:
     per = period / rig.dt
     text = f"the fastest motion of the declared model takes {period:.2g} s, {per:.0f} samples; " if period < 1e6 else ""
     text += f"a velocity changes by {100 * turn:.2g} % of its range from sample to sample"
-    hint = "sample faster, or look at the units of dt and of the parameters"
-    yield _result("sampling", text, {hint: per < 5 or turn > 0.3}, {hint: per < 10 or turn > 0.1})
+    bad = per < 10 or turn > 0.1, per < 5 or turn > 0.3
+    yield _row("sampling", text, {"sample faster, or look at the units of dt and of the parameters": bad})
 
 
 def _noise(rig: Rig, model: StateSpaceModel, data: Dataset) -> Iterator[CheckResult]:
@@ -249,15 +235,15 @@ def _noise(rig: Rig, model: StateSpaceModel, data: Dataset) -> Iterator[CheckRes
         seen = reading_noise(signal)
         noisy = max(seen, declared or 0.0) > 0.3 * _std(signal)
         alone = name not in model.system.sensors  # of three axes one may sense nothing
-        ratio, text = 1.0, f"about {seen:.2g} {unit}, not declared, so it is estimated"
-        if declared:
-            ratio = seen / declared
-            text = f"declared {declared:.2g} {unit}, the log's high frequencies show {seen:.2g} {unit}"
-        more = "declare more, or leave it out to have it estimated"
-        drowned = "the motion hardly rises above it: move or excite more, or look at the units"
-        tame = "the log was filtered, or less is true"
-        errors = {more: ratio > 30, drowned: noisy and alone}
-        yield _result("noise", f"{name}: {text}", errors, {tame: ratio < 0.1, more: ratio > 3, drowned: noisy})
+        ratio = seen / declared if declared else 1.0
+        said = f"declared {declared:.2g} {unit}" if declared else "not declared, so it is estimated"
+        text = f"{seen:.2g} {unit} by the log's high frequencies, {said}"
+        hints = {
+            "declare more, or leave it out to have it estimated": (ratio > 3, ratio > 30),
+            "the motion hardly rises above it: move or excite more, or look at the units": (noisy, noisy and alone),
+            "the log was filtered, or less is true": (ratio < 0.1,),
+        }
+        yield _row("noise", f"{name}: {text}", hints)
 
 
 def rates(rig: Rig, data: Dataset) -> Iterator[CheckResult]:
@@ -272,8 +258,8 @@ def rates(rig: Rig, data: Dataset) -> Iterator[CheckResult]:
         text = f"{rate} is the derivative of {name}, {lag} {'late' if found.late > 0 else 'early'}"
         scaled = f"{rate} is {found.scale:.4g} times the derivative of {name}: correct the unit or gear of one"
         shifted = f"{late} is {lag} later than {first}; take {late} out of [measurement] columns, or filter neither"
-        warnings = dict(zip((scaled, shifted), found.wrong, strict=True))
-        yield _result("rate", "" if any(found.wrong) else text, {}, warnings)
+        hints = {scaled: found.wrong[:1], shifted: found.wrong[1:]}
+        yield _row("rate", "" if any(found.wrong) else text, hints)
 
 
 def torques(rig: Rig, system: AbstractSystem, data: Dataset, scales: Scales) -> Iterator[CheckResult]:
@@ -287,18 +273,15 @@ def torques(rig: Rig, system: AbstractSystem, data: Dataset, scales: Scales) -> 
         torque = abs(gear) * float(np.percentile(np.abs(u[data.valid]), 99))
         ratio = torque / needed[joint - 1]
         text = f"{name}: up to {torque:.3g} {unit}, gravity and inertia of joint {joint} need {needed[joint - 1]:.3g}"
-        hint = f"look at its unit ({unit}) and at masses (kg) and lengths (m)"
-        odd, wrong = (ratio > most or 0 < ratio < least for most, least in ((30, 1e-3), (100, 3e-4)))
-        yield _result("torque", text, {hint: wrong}, {hint: odd})
+        odd = ratio > 30 or 0 < ratio < 1e-3, ratio > 100 or 0 < ratio < 3e-4
+        yield _row("torque", text, {f"look at its unit ({unit}) and at masses (kg) and lengths (m)": odd})
     yield from _at_stops(rig, data)
     for text in sentences(identifiability(rig, system, build_servos(rig))):
         yield CheckResult(WARNING, "parameters", text)
     if kept := not_identifiable(rig, system, data):
-        text = (
-            "nothing drives the machine, so that its motion does not determine the scale of its masses and friction: "
-        )
-        text += f"kept as declared is {', '.join(f'{name} = {rig.parameters[name]} {rig.unit(name)}' for name in kept)}"
-        yield CheckResult(WARNING, "scale", f"{text}, and all else is relative to that")
+        text = "nothing drives the machine, so that its motion does not determine the scale of its masses and friction"
+        held = ", ".join(f"{name} = {rig.parameters[name]} {rig.unit(name)}" for name in kept)
+        yield CheckResult(WARNING, "scale", f"{text}: kept as declared is {held}, and all else is relative to that")
 
 
 def _at_stops(rig: Rig, data: Dataset) -> Iterator[CheckResult]:
@@ -308,8 +291,8 @@ def _at_stops(rig: Rig, data: Dataset) -> Iterator[CheckResult]:
         if joint.range is None or name not in rig.measured:
             continue
         y, (low, high) = np.asarray(data.y)[..., rig.measured.index(name)], joint.range
-        margin = 0.005 * (high - low)  # within which a reading counts as at its end
-        if count := int(np.sum((y < low + margin) | (y > high - margin))):
+        # within half a percent of its range a reading counts as at its end
+        if count := int(np.sum(np.abs(y - 0.5 * (low + high)) > 0.495 * (high - low))):
             text = f"{name}: {counted(count, 'reading')} at or beyond its range of {low:.4g} to {high:.4g}"
             text += f" {rig.unit(name)}; stops have no force in the model: leave those stretches out, or let diagnose"
             yield CheckResult(WARNING, "range", f"{text} find hard_stop")
@@ -324,21 +307,20 @@ def dynamics(rig: Rig, system: AbstractSystem, data: Dataset) -> Iterator[CheckR
     if problem is None:
         return
     plain = problem.remains()
-    explained = lambda left: ", ".join(f"{100 * (1 - share):.4g} %" for share in left)  # noqa: E731
+    explained = lambda left: ", ".join(f"{100 * (1 - share):.4g} %" for share in left) + " of the torque, by joint"  # noqa: E731
     if found := mistakes(explanations(rig, problem), plain):
         text = ", or just as well: ".join(one.text for one in found)
-        text += f"; with that the declared bodies explain {explained(found[0].remains)} of the torque, by joint, "
-        mark = ERROR if any(one.ruins for one in found) else WARNING
-        yield CheckResult(mark, "dynamics", f"{text}as it is {explained(plain)}")
+        text += f"; with that the declared bodies explain {explained(found[0].remains)}, as it is {explained(plain)}"
+        yield _row("dynamics", text, {"": (True, any(one.ruins for one in found))})
     elif np.all(plain < UNEXPLAINED):
-        text = f"declared bodies and a static friction explain {explained(plain)} of the torque, by joint"
-        for name, slope in zip(rig.input_columns, gains(problem), strict=True):
+        text, shifted = f"declared bodies and a static friction explain {explained(plain)}", []
+        for i, (name, slope) in enumerate(zip(rig.input_columns, gains(problem), strict=True)):
             text += f"; {name}: slope {slope:.3g}"
-        lags = {name: lag(problem, i) for i, (name, kind) in enumerate(rig.kinds.items()) if kind == TORQUE}
-        for name, when in lags.items():
-            text += f"; {name}: {when.rows:.2f} +- {when.std:.1g} rows late" if np.isfinite(when.std) else ""
-        yield CheckResult(OK, "dynamics", text)
-        yield from (CheckResult(WARNING, "hold", f"{n}: {late(rig, when)}") for n, when in lags.items() if when.counts)
+            if rig.kinds[name] == TORQUE:
+                when = lag(problem, i)
+                text += f", {when.rows:.2f} +- {when.std:.1g} rows late"
+                shifted += [CheckResult(WARNING, "hold", f"{name}: {late(rig, when)}")] * when.counts
+        yield from (CheckResult(OK, "dynamics", text), *shifted)
 
 
 def late(rig: Rig, when: Lag) -> str:
@@ -347,19 +329,9 @@ def late(rig: Rig, when: Lag) -> str:
     side = f"{abs(when.rows):.2g} +- {when.std:.1g} rows {'later' if when.rows > 0 else 'earlier'}"
     text = f"torque and motion agree best if it acts {side} than `input_hold` has it ({when.rows * rig.dt:.2g} s)"
     if abs(when.rows - between) < SAME_HOLD:
-        kind = "a measured signal, which is not held" if other == SMOOTH else "a command that is held"
-        return f'{text}: it is {kind}; write [sampling] input_hold = "{other}"'
-    drive = "a drive or a bus that is late (`diagnose` finds input_delay)"
-    cause = drive if when.rows > 0 else "readings that are late"
+        return f'{text}: write [sampling] input_hold = "{other}"'
+    cause = "a late drive or bus (`diagnose` finds input_delay)" if when.rows > 0 else "late readings"
     return f"{text}: {cause}, or two clocks (`nnap-em import --shift TOPIC=SECONDS`)"
-
-
-def _stiff(rig: Rig, system: AbstractSystem, data: Dataset) -> Iterator[CheckResult]:
-    """A servo that no integration step of a sample can follow."""
-    steps = steps_of_sample(system, build_servos(rig), data, rig.dt)
-    if steps > MOST_STEPS:
-        text = f"the stiffest servo would need {steps:.0f} integration steps of a sample, and gets {MOST_STEPS}"
-        yield CheckResult(ERROR, "servo", f"{text}: look at the units of its gains, or sample faster")
 
 
 def _needed(
@@ -369,12 +341,11 @@ def _needed(
 
     A joint that bears nothing at zero may bear much elsewhere.  Joints that nobody reads are anywhere in a turn.
     """
-    read = [(i, rig.measured.index(name)) for i, name in enumerate(system.coordinates) if name in rig.measured]
-    seen = np.asarray(data.y)[..., [column for _, column in read]][np.asarray(data.valid)]
+    read = {i: rig.measured.index(name) for i, name in enumerate(system.coordinates) if name in rig.measured}
+    seen = np.asarray(data.y)[..., [*read.values()]][np.asarray(data.valid)]
     seen = seen[np.isfinite(seen).all(axis=1)]
-    seen = seen[np.linspace(0, len(seen) - 1, POSES).astype(int)] if len(seen) else np.zeros((POSES, len(read)))
     q = np.where(system.angles, np.random.default_rng(0).uniform(-np.pi, np.pi, (POSES, len(system.angles))), 0.0)
-    q[:, [joint for joint, _ in read]] = seen
+    q[:, [*read]] = seen[np.linspace(0, len(seen) - 1, POSES).astype(int)] if len(seen) else 0.0
     mass, gravity = map(np.asarray, _loads(system, jnp.asarray(q)))
     return np.percentile(np.abs(gravity), 99, axis=0) + np.mean(mass, axis=0) * acceleration
 
@@ -390,15 +361,12 @@ def _motion(rig: Rig, model: StateSpaceModel, data: Dataset, along: Along) -> It
         unit = model.system.unit(name)
         v, seen = _velocity(rig, model, data, along, joint)
         inner = v[np.isfinite(v)]
-        if not inner.size:
-            text = f"joint {joint + 1}{seen}: no velocity, as no sequence can be followed"
-            yield CheckResult(ERROR, "motion", text)
-            continue
-        low, high = np.percentile(inner, [1, 99])
+        low, high = np.percentile(inner, [1, 99]) if inner.size else (0.0, 0.0)
         top = max(-low, high)
         if top <= max(3 * rig.noise_std.get(name, 0.0), 1e-9):
-            text = f"joint {joint + 1} hardly moves ({top:.2g} {unit}); drive it through its range"
-            yield CheckResult(ERROR, "motion", text)
+            text = f"hardly moves ({top:.2g} {unit}); drive it through its range"
+            text = text if inner.size else "no velocity, as no sequence can be followed"
+            yield CheckResult(ERROR, "motion", f"joint {joint + 1}{seen}: {text}")
             continue
         near_rest = float(np.mean(np.abs(inner) < 0.05 * top))
         covered = float(np.mean(np.histogram(inner, np.linspace(-top, top, 21))[0] >= 5))
@@ -406,13 +374,12 @@ def _motion(rig: Rig, model: StateSpaceModel, data: Dataset, along: Along) -> It
         text = f"joint {joint + 1}{seen}: {low:.3g} to {high:.3g} {unit}, {100 * covered:.0f} % of that range covered, "
         text += f"{100 * near_rest:.0f} % of the time near rest, {turns} changes of direction"
         hints = {
-            "it moves in one direction only: friction in the other stays unknown": min(-low, high) < 0.2 * top,
-            "too few turns to identify Coulomb friction": turns < 4,
-            "it rests most of the time: move more, and slowly through zero velocity": near_rest > 0.5,
-            "many velocities are never visited: the curve is a guess there": covered < 0.5,
+            "it moves in one direction only: friction in the other stays unknown": (min(-low, high) < 0.2 * top,),
+            "too few turns to identify Coulomb friction": (turns < 4,),
+            "it rests most of the time: move more, and slowly through zero velocity": (near_rest > 0.5,),
+            "many velocities are never visited: the curve is a guess there": (covered < 0.5,),
         }
-        result = _result("motion", text, {}, hints)
-        yield result if rig.friction else result._replace(mark=OK)
+        yield _row("motion", text, hints if rig.friction else {})
 
 
 def _velocity(
@@ -430,19 +397,16 @@ def _velocity(
     return along.x[..., len(model.system.coordinates) + joint], " (never seen, by the declared model)"
 
 
-def _observability(
-    model: StateSpaceModel, along: Along, valid: np.ndarray, rows: int | None = None
-) -> Iterator[CheckResult]:
+def _observability(model: StateSpaceModel, along: Along, valid: np.ndarray) -> Iterator[CheckResult]:
     """Observability of the state from readings alone, by the Gramian sum Phi' C' R^-1 C Phi along the logs.
 
     [Krener & Ide 2009, "Measures of unobservability", CDC]  It is judged in units of how far each state moves.
     """
     names, dof = model.system.states, len(model.system.coordinates)
-    rows = rows or _window(model.dt)
     scale = np.maximum([_std(one) for one in along.x.reshape(-1, len(names)).T], 1e-12)
     noise, grams = np.exp(0.5 * np.asarray(model.log_r))[:, None], []
     for transition, reading, ok in zip(along.transition, along.reading, valid, strict=True):
-        last = min(rows, int(ok.sum()))
+        last = int(ok.sum())
         if last >= 2 and np.isfinite(transition[:last]).all():
             gram = gramian(transition[:last], reading[:last] / noise, scale)
             grams += [gram] if np.isfinite(gram).all() else []
@@ -450,16 +414,16 @@ def _observability(
         text = "the declared model cannot follow the logs; look at units, signs and parameters"
         yield CheckResult(ERROR, "states", text)
         return
-    values = np.median([np.linalg.eigvalsh(gram) for gram in grams], axis=0)
-    known = dict(zip(names, np.median([undetermined(gram) for gram in grams], axis=0), strict=True))
-    dark = [name for name in names if known[name] > 0.5]
-    weak = [name for name in names if 0.2 < known[name] <= 0.5]
+    seen = np.sum(np.median([np.linalg.eigvalsh(gram) for gram in grams], axis=0) > 1)
+    left = dict(zip(names, np.median([undetermined(gram) for gram in grams], axis=0), strict=True))
+    dark, weak = ([n for n in names if least < left[n] <= most] for least, most in ((0.5, np.inf), (0.2, 0.5)))
     shown = "move so that the hidden joint shakes the rest" if dof else "change the inputs so that it shows"
-    spoilt = any(name in names[dof:] for name in dark)
-    text = f"{rows * model.dt:.3g} s of readings determine {np.sum(values > 1)} of {len(names)} directions of the state"
-    hidden = f"not determined: {', '.join(dark)}"
-    warnings = {hidden: dark and not spoilt, f"hardly determined: {', '.join(weak)}": weak}
-    yield _result("states", text, {f"{hidden}: measure more of the state, or {shown}": spoilt}, warnings)
+    hints = {
+        f"not determined: {', '.join(dark)}: measure more of the state, or {shown}": (dark, {*dark} & {*names[dof:]}),
+        f"hardly determined: {', '.join(weak)}": (weak,),
+    }
+    text = f"{valid.shape[1] * model.dt:.3g} s of readings determine {seen} of {len(names)} directions of the state"
+    yield _row("states", text, hints)
 
 
 def undetermined(gram: Float[np.ndarray, "state state"]) -> Float[np.ndarray, " state"]:

@@ -7,6 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
+from scipy.linalg import null_space
+from scipy.sparse.csgraph import connected_components
 
 from ..data.dataset import Dataset
 from ..data.rig import Declared, Rig
@@ -20,6 +22,8 @@ _MOMENTS = ("delay", "limit")
 """Numbers of a servo that the slopes of its torque do not know."""
 _POWERS = 4
 """Powers of a rate that stand for a learned friction."""
+_ROUNDING = 1e-4
+"""Share of the equations of motion that the parameters that scale them may miss: rounding, in 32 bits too."""
 
 
 class Identifiability(NamedTuple):
@@ -39,67 +43,61 @@ def identifiability(rig: Rig, system: AbstractSystem, servos: tuple[Servo, ...] 
     M(q) a + c(q, v) - tau(u, q, v), at the accelerations that the servos give, beside a learned friction of the joints.
     Delays and limits are left out: only single moments depend on them.
     """
-    names = [name for name, declared in rig.parameters.items() if declared.std > 0]
-    names = [name for name in names if name in rig.bodies or name.rpartition(".")[2] not in _MOMENTS]
-    if not names:
-        return Identifiability()
-    columns, friction, _ = _columns(system, servos, names)
-    columns = columns * np.asarray([rig.parameters[name].std for name in names])[None, :]
-    size = np.linalg.norm(columns, axis=0)
-    felt = size > SHARE_LEFT * size.max()
-    labels = [name for name, one in zip(names, felt, strict=True) if one]
-    columns = columns[:, felt] / size[felt]
+    columns, friction, _ = _columns(rig, system, servos)
+    size = {name: np.linalg.norm(column) for name, column in columns.items()}
+    labels = [name for name in columns if size[name] > SHARE_LEFT * max(size.values())]
+    never, scaled = (
+        tuple(name for name in columns if name not in labels),
+        [columns[name] / size[name] for name in labels],
+    )
+    if not labels:
+        return Identifiability(never)
     if servos and rig.friction:
         labels += [f"the learned friction of joint {1 + i // _POWERS}" for i in range(friction.shape[1])]
-        columns = np.concatenate([columns, friction / np.linalg.norm(friction, axis=0)], axis=1)
-    _, values, rows = np.linalg.svd(columns, full_matrices=True)
-    rank = int(np.sum(values > SHARE_LEFT * values.max(initial=1e-300)))
-    shared = np.abs(rows[rank:].T @ rows[rank:])
-    groups: list[set[int]] = []
-    for i in np.flatnonzero(np.diag(shared) > SHARE_LEFT):
-        group = {int(i), *map(int, np.flatnonzero(shared[i] > SHARE_LEFT))}
-        for other in [g for g in groups if g & group]:
-            groups.remove(other)
-            group |= other
-        groups.append(group)
-    together = tuple(tuple(dict.fromkeys(labels[i] for i in sorted(group))) for group in groups)
-    return Identifiability(tuple(name for name, one in zip(names, felt, strict=True) if not one), together)
+        scaled += [*(friction / np.linalg.norm(friction, axis=0)).T]
+    free = np.asarray(null_space(np.stack(scaled, axis=1), rcond=SHARE_LEFT))
+    shared = np.abs(free @ free.T) > SHARE_LEFT
+    groups = connected_components(shared)[1]
+    together = [np.flatnonzero(groups == group) for group in dict.fromkeys(groups[np.diag(shared)])]
+    return Identifiability(never, tuple(tuple(dict.fromkeys(labels[i] for i in group)) for group in together))
 
 
 def _columns(
-    system: AbstractSystem, servos: tuple[Servo, ...], names: list[str]
-) -> tuple[Float[np.ndarray, "row param"], Float[np.ndarray, "row curve"], Float[np.ndarray, " row"]]:
-    """Derivatives of the inverse dynamics at random states by the parameters, functions of each joint's rate, and the
-    inverse dynamics themselves.
+    rig: Rig, system: AbstractSystem, servos: tuple[Servo, ...] = ()
+) -> tuple[dict[str, Float[np.ndarray, " row"]], Float[np.ndarray, "row curve"], Float[np.ndarray, " row"]]:
+    """Derivatives of the inverse dynamics at random states by the uncertain parameters, in declared standard
+    deviations, functions of each joint's rate, and the inverse dynamics themselves.
     """
     rng, dof = np.random.default_rng(0), len(system.coordinates)
     q, v, a = (jnp.asarray(rng.uniform(-3.0, 3.0, (8 + 4 * dof, dof)), float) for _ in range(3))
     u = jnp.asarray(rng.uniform(-3.0, 3.0, (8 + 4 * dof, len(system.joints))), float)
     servos = tuple(unlimited(servo.at(None)) for servo in servos)
-    of_servos = [name for name in names if any(name == f"{s.column}.{key}" for s in servos for key in s.values)]
+    drives = {f"{servo.column}.{key}": value for servo in servos for key, value in servo.values.items()}
+    std = {name: of.std for name, of in rig.parameters.items() if of.std > 0}
+    std = {name: one for name, one in std.items() if name in rig.bodies or name.rpartition(".")[2] not in _MOMENTS}
+    if not std:
+        return {}, np.zeros((0, 0)), np.zeros(0)
+    values = {name: drives[name] if name in drives else system.parameter(name) for name in std}
 
     def driven(system, servos, q, v, u):
         if not servos:
             return jnp.zeros_like(q)
-        fed = jnp.stack([servo.fed(u[i][None], hooks.Sampling(1.0).through)[0] for i, servo in enumerate(servos)])
+        (fed,) = hooks.fed((), servos, system, u[None], hooks.Sampling(1.0))
         return system.drive(hooks.driven((), servos, system, fed, q, v))
 
     def force(values, a):
-        numbers = dict(zip(names, values, strict=True))
-        changed = system.with_parameters({name: value for name, value in numbers.items() if name not in of_servos})
-        changed_servos = tuple(servo.with_values({name: numbers[name] for name in of_servos}) for servo in servos)
-        needed = lambda q, v, a, u: changed.mass(q) @ a + changed.bias(q, v) - driven(changed, changed_servos, q, v, u)  # noqa: E731
+        other = system.with_parameters({name: value for name, value in values.items() if name not in drives})
+        others = tuple(servo.with_values(values) for servo in servos)
+        needed = lambda q, v, a, u: other.mass(q) @ a + other.bias(q, v) - driven(other, others, q, v, u)  # noqa: E731
         return jax.vmap(needed)(q, v, a, u).ravel()
 
-    numbers = {f"{servo.column}.{key}": value for servo in servos for key, value in servo.values.items()}
-    values = [numbers[name] if name in of_servos else system.parameter(name) for name in names]
     if servos:
         accelerations = lambda q, v, u: jnp.stack(system.acceleration(q, v, driven(system, servos, q, v, u)))  # noqa: E731
         a = jax.jit(jax.vmap(accelerations))(q, v, u)
     slopes, whole = jax.jit(jax.jacfwd(lambda *at: 2 * (force(*at),), has_aux=True))(values, a)
     powers = np.asarray(v)[:, :, None] ** np.arange(_POWERS)
     curves = np.einsum("rjp,ij->rijp", powers, np.eye(dof)).reshape(q.size, -1)
-    return np.stack([np.asarray(slope, np.float64) for slope in slopes], axis=1), curves, np.asarray(whole)
+    return {name: std[name] * np.asarray(slopes[name], float) for name in std}, curves, np.asarray(whole)
 
 
 def sentences(result: Identifiability) -> list[str]:
@@ -118,17 +116,14 @@ def not_identifiable(rig: Rig, system: Any, data: Dataset) -> tuple[str, ...]:
     """
     if rig.equations or rig.input_kinds or np.any(np.asarray(data.u)[np.asarray(data.valid)]):
         return ()  # the gains of servos are numbers of the machine
-    left, held = [name for name, declared in rig.bodies.items() if declared.std > 0], []
-    columns, _, whole = _columns(system, (), left) if left else (np.zeros((0, 0)), None, np.zeros(0))
-    columns = dict(zip(left, columns.T, strict=True))
-    # Share of the equations of motion that may be missed by the parameters that scale them: rounding, in 32 bits too
-    rounding = 1e-4
+    (left, _, whole), held = _columns(rig, system), []
     while left:
-        one = np.stack([rig.parameters[name].std * columns[name] for name in left], axis=1)
-        steps = np.linalg.lstsq(one, whole, rcond=1e-9)[0]
-        if np.linalg.norm(one @ steps - whole) > rounding * np.linalg.norm(whole):
+        columns = np.stack([*left.values()], axis=1)
+        steps = np.linalg.lstsq(columns, whole, rcond=1e-9)[0]
+        if np.linalg.norm(columns @ steps - whole) > _ROUNDING * np.linalg.norm(whole):
             break
-        held.append(left.pop(int(np.argmax(np.abs(steps)))))
+        held.append([*left][int(np.argmax(np.abs(steps)))])
+        del left[held[-1]]
     return tuple(held)
 
 

@@ -17,12 +17,15 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Bool, Float
+from scipy.linalg import orth
 from scipy.optimize import least_squares
+from scipy.signal import savgol_coeffs
 
 from ..data.dataset import Dataset
 from ..data.noise import reading_noise
 from ..data.rig import HOLD, SMOOTH, Rig
+from ..em.prior import ParameterPrior, declared_prior
 from ..em.servos import build_servos
 from ..model import hooks
 from ..systems import AbstractSystem
@@ -98,16 +101,12 @@ class Motion(NamedTuple):
     a: Float[np.ndarray, "piece time dof"]
     torque: Float[np.ndarray, "piece time input"]
     """Generalised force of every input, mean over the intervals before and behind a row, as `TRIANGLE` [N m, or N]."""
-    coasting: Float[np.ndarray, "piece time input"]
-    """The same, but none where the command of a `voltage` drive is 0."""
+    braking: Float[np.ndarray, "piece time input"]
+    """Part of it that is back-EMF of a `voltage` drive while its command is 0."""
     inertial: Float[np.ndarray, " tap"]
     """Filter of what holds an acceleration."""
     direct: Float[np.ndarray, "dof tap"]
     """Filter of all else, which has the window of the joint's acceleration in it."""
-
-    def filtered_inputs(self, system: AbstractSystem, torque: Float[np.ndarray, "piece time input"]) -> np.ndarray:
-        """`torque` or `coasting` as an acceleration of its joint is filtered."""
-        return _by_joint(torque, self.direct[[joint - 1 for joint in system.joints]])
 
 
 class Regression(NamedTuple):
@@ -115,9 +114,8 @@ class Regression(NamedTuple):
 
     system: AbstractSystem
     motion: Motion
-    mean: dict[str, Array]
+    prior: ParameterPrior
     """Uncertain numbers of the machine."""
-    std: Float[np.ndarray, " param"]
     least: Float[np.ndarray, " param"]
     """Smallest changes of these numbers [std]."""
     rows: Bool[np.ndarray, "piece time"]
@@ -133,53 +131,57 @@ class Regression(NamedTuple):
         inertia, velocity, gravity = self.plain
         return np.sqrt(np.var(inertia + velocity, axis=0) + np.var(gravity, axis=0)) + 1e-300
 
-    def parts(self, sign: np.ndarray | float = 1.0, shift: np.ndarray | float = 0.0, *, slopes: bool = False):
-        """Torques of inertia, velocities and gravity where q is sign (reading - shift), or their slopes by the mean."""
-        motion = self.motion
-        rows = ((sign * part).reshape(-1, motion.q.shape[-1]) for part in (motion.q - shift, motion.v, motion.a))
-        parts = np.asarray(_torques(self.system, self.mean, *map(jnp.asarray, rows), slopes=slopes))
+    @property
+    def driven(self) -> list[int]:
+        """Joints of the inputs, counted from 0; one input each."""
+        return [joint - 1 for joint in self.system.joints]
+
+    def parts(
+        self,
+        moved: np.ndarray | float = 0.0,
+        *,
+        sign: np.ndarray | float = 1.0,
+        shift: np.ndarray | float = 0.0,
+        gravity: np.ndarray | float = 1.0,
+        slopes: bool = False,
+    ) -> Float[np.ndarray, "part row dof *param"]:
+        """Torques of inertia, velocities and gravity with numbers so many std from their mean, or the slopes by them.
+
+        The coordinates are sign (reading - shift), and of every joint's gravity a share counts.
+        """
+        motion, share = self.motion, gravity * np.ones(len(self.system.coordinates))
+        moved = moved * np.ones(self.prior.size)
+        rows = ((sign * part).reshape(-1, len(share)) for part in (motion.q - shift, motion.v, motion.a))
+        parts = np.asarray(_torques(self.system, self.prior, *map(jnp.asarray, (moved, share, *rows)), slopes=slopes))
         inertia, *others = np.moveaxis(parts.reshape(*motion.q.shape[:2], *parts.shape[1:]), 2, 0)
         both = [filtered(inertia, motion.inertial), *(_by_joint(part, motion.direct) for part in others)]
         return np.stack(both)[:, self.rows]
 
-    def remains(
-        self,
-        inputs: Float[np.ndarray, "row input"] | None = None,
-        sign: np.ndarray | float = 1.0,
-        shift: np.ndarray | float = 0.0,
-        gravity: np.ndarray | float = 1.0,
-    ) -> Float[np.ndarray, " dof"]:
-        """Share of the squared torque that stays unexplained, by joint, with these changes of the log."""
-        share = np.stack([np.ones_like(self.size), np.ones_like(self.size), gravity * np.ones_like(self.size)])
+    def remains(self, inputs: Float[np.ndarray, "row input"] | None = None, **change) -> Float[np.ndarray, " dof"]:
+        """Share of the squared torque that stays unexplained, by joint, with other inputs or changes of `parts`."""
         applied = self.applied(self.inputs if inputs is None else inputs)
 
-        def at(moved: np.ndarray) -> "Regression":
-            values = zip(self.mean.items(), moved * self.std, strict=True)
-            return self._replace(mean={name: mean + change for (name, mean), change in values})
-
         def error(moved: np.ndarray) -> np.ndarray:
-            return self.beyond(np.einsum("pj,prj->rj", share, at(moved).parts(sign, shift)) - applied).ravel()
+            return self.beyond(self.parts(moved, **change).sum(axis=0) - applied).ravel()
 
         def slopes(moved: np.ndarray) -> np.ndarray:
-            columns = np.einsum("pj,prjk->krj", share, at(moved).parts(sign, shift, slopes=True))
-            return np.stack([self.beyond(one).ravel() for one in columns], axis=-1) * self.std
+            return self.beyond(self.parts(moved, **change, slopes=True).sum(axis=0)).reshape(-1, len(moved))
 
-        moved = np.zeros_like(self.std)
+        moved = np.zeros(self.prior.size)
         if len(moved):
             moved = least_squares(error, moved, slopes, (self.least, WITHIN), max_nfev=PASSES).x
-        return np.mean(error(moved).reshape(-1, len(self.size)) ** 2, axis=0)
+        return np.mean(error(moved).reshape(applied.shape) ** 2, axis=0)
 
     def applied(self, inputs: Float[np.ndarray, "row input"]) -> Float[np.ndarray, "row dof"]:
         """Generalised force of the inputs."""
         out = np.zeros((len(inputs), len(self.size)))
-        for i, joint in enumerate(self.system.joints):
-            out[:, joint - 1] += inputs[:, i]
+        out[:, self.driven] = inputs
         return out
 
-    def beyond(self, torque: Float[np.ndarray, "row dof"]) -> Float[np.ndarray, "row dof"]:
+    def beyond(self, torque: Float[np.ndarray, "row dof *any"]) -> Float[np.ndarray, "row dof *any"]:
         """Part of a torque that no static friction explains, in units of `size`."""
-        out = [torque[:, j] - basis @ (basis.T @ torque[:, j]) for j, basis in enumerate(self.friction)]
-        return np.stack(out, axis=1) / self.size
+        columns = zip(np.moveaxis(torque, 1, 0), self.friction, self.size, strict=True)
+        return np.stack([(one - basis @ (basis.T @ one)) / size for one, basis, size in columns], axis=1)
 
 
 def motion_along(rig: Rig, system: AbstractSystem, data: Dataset) -> Motion | None:
@@ -193,29 +195,23 @@ def motion_along(rig: Rig, system: AbstractSystem, data: Dataset) -> Motion | No
     if not seen or rig.scale_columns or not {*rig.kinds.values()} <= {"torque", "voltage"}:
         return None
     fed = np.asarray(data.u, float)[..., : len(system.joints)]
-    still = fed == 0
+    still, sampled = fed == 0, hooks.Sampling(rig.dt, rig.input_hold == SMOOTH)
     if servos:
-        through = hooks.Sampling(rig.dt, rig.input_hold == SMOOTH).through
-        each = jax.vmap(lambda u: jnp.stack([of.fed(u[:, i], through) for i, of in enumerate(servos)], axis=-1))
-        fed = np.asarray(each(jnp.asarray(fed)))
+        fed = jax.vmap(lambda u: hooks.fed((), servos, system, u, sampled))(jnp.asarray(fed))
     y, u, still = (_pieces(np.asarray(part, float), valid) for part in (data.y, fed, still))
-    value, slope, bend = (_derivative(order, rig.dt) for order in range(3))
-    # an acceleration is the mean of the true one with these weights
+    value, slope, bend = (savgol_coeffs(WIDTH, ORDER, deriv, rig.dt, use="dot") for deriv in range(3))
+    # an acceleration is the mean of the true one with a window, of readings of the position or of the rate
     of_position, of_rate = np.cumsum(np.cumsum(bend))[:-2] * rig.dt**2, -np.cumsum(slope)[:-1] * rig.dt
-    joints, sources = [], []
+    ways = (slope, bend, np.pad(of_position, 1)), (value, slope, np.convolve(of_rate, [0.5, 0.5]))
+    columns, joints, sources = dict(zip(read, np.moveaxis(y, -1, 0), strict=True)), [], []
     for name, rate, _ in coordinates:
-        options = []
-        if name in read:
-            x = y[..., read.index(name)]
-            options.append((reading_noise(x), bend, np.pad(of_position, 1), filtered(x, slope), filtered(x, bend)))
-        if rate in read:
-            x = y[..., read.index(rate)]
-            window = np.convolve(of_rate, [0.5, 0.5])
-            options.append((reading_noise(x), slope, window, filtered(x, value), filtered(x, slope)))
-        noise, taps, window, v, a = min(options, key=lambda option: option[0] * np.linalg.norm(option[1]))
-        q = filtered(y[..., read.index(name)], value) if name in read else np.nancumsum(v, axis=1) * rig.dt
+        both = zip((name, rate), ways, strict=True)
+        options = [(key, reading_noise(columns[key]), *way) for key, way in both if key in columns]
+        key, noise, first, second, window = min(options, key=lambda option: option[1] * np.linalg.norm(option[3]))
+        v, a = filtered(columns[key], first), filtered(columns[key], second)
+        q = filtered(columns[name], value) if name in columns else np.nancumsum(v, axis=1) * rig.dt
         joints.append((q, v, a))
-        sources.append((noise, taps, window))
+        sources.append((noise, second, window))
     q, v, a = (np.stack(part, axis=-1) for part in zip(*joints, strict=True))
     low = None
     # Rows of the low-pass: the first that leaves accelerations a noise below `ACCEL_NOISE`, else the last that fits
@@ -233,14 +229,15 @@ def motion_along(rig: Rig, system: AbstractSystem, data: Dataset) -> Motion | No
     edge = WIDTH // 2
     both = (filtered(part, np.array(TRIANGLE[rig.input_hold])) for part in (u, still))
     torque, still = (np.pad(part, ((0, 0), (1, 1), (0, 0)), constant_values=np.nan)[:, edge:-edge] for part in both)
-    gears, coasting = np.asarray(system.gears), torque.copy()
-    for i, servo in enumerate(servos):
-        fed = torque[..., i], 0.0 * torque[..., i]
-        own = [jnp.asarray([gears[i] * x[..., system.joints[i] - 1]] * 2) for x in (q, v)]
-        driven, braking = np.asarray(jnp.vectorize(servo.torque)(jnp.asarray(fed), *own))
-        torque[..., i], coasting[..., i] = driven, driven - still[..., i] * braking * (servo.kind == "voltage")
+    braking = np.zeros_like(torque)
+    if servos:
+        driven = jax.vmap(jax.vmap(lambda u, q, v: hooks.driven((), servos, system, u, q, v)))
+        torque, unfed = (np.asarray(driven(*map(jnp.asarray, (u, q, v)))) for u in (torque, braking))
+        volts = np.array([servo.kind == "voltage" for servo in servos])
+        braking = np.where((still > 0) & volts, still * unfed, 0.0)
+    gears = np.asarray(system.gears)
     direct = np.stack([np.convolve(low, window) for *_, window in sources])
-    return Motion(q, v, a, torque * gears, coasting * gears, np.pad(low, edge), direct)
+    return Motion(q, v, a, torque * gears, braking * gears, np.pad(low, edge), direct)
 
 
 def regression(rig: Rig, system: AbstractSystem, data: Dataset) -> Regression | None:
@@ -250,14 +247,13 @@ def regression(rig: Rig, system: AbstractSystem, data: Dataset) -> Regression | 
         return None
     held = not_identifiable(rig, system, data)
     uncertain = {name: of for name, of in rig.parameters.items() if of.std and name in rig.bodies and name not in held}
-    mean, std = {n: jnp.asarray(of.mean, float) for n, of in uncertain.items()}, [of.std for of in uncertain.values()]
+    prior = declared_prior(uncertain)
     positive = [of.mean > 0 and ("." not in n or n.endswith(("mass", "armature"))) for n, of in uncertain.items()]
-    both = zip(uncertain.values(), positive, strict=True)
-    least = np.asarray([max(-WITHIN, -of.mean / of.std) if above else -WITHIN for of, above in both])
-    inputs = motion.filtered_inputs(system, motion.torque)
+    least = np.where(positive, np.maximum(-WITHIN, -prior.mean / prior.std), -WITHIN)
+    inputs = _by_joint(motion.torque, motion.direct[[joint - 1 for joint in system.joints]])
     maps = [filtered(_hats(motion.v[..., j]), taps) for j, taps in enumerate(motion.direct)]
     full = np.ones(inputs.shape[:2], bool)
-    problem = Regression(system, motion, mean, np.asarray(std), least, full, inputs, [], inputs)
+    problem = Regression(system, motion, prior, least, full, inputs, [], inputs)
     plain = problem.parts().reshape(3, *full.shape, -1)
     rows = np.all([np.isfinite(part).all(axis=-1) for part in (*plain, inputs, *maps)], axis=0)
     if rows.sum() < FILTERED_ROWS:
@@ -268,34 +264,42 @@ def regression(rig: Rig, system: AbstractSystem, data: Dataset) -> Regression | 
 
 def explanations(rig: Rig, problem: Regression) -> Iterator[Explanation]:
     """Every mistake that a log may have, corrected."""
-    names, system, eye = rig.input_columns, problem.system, np.eye(len(problem.size))
+    for text, ruins, change in _corrections(rig, problem):
+        yield Explanation(problem.remains(**change), text, ruins)
+
+
+def _corrections(rig: Rig, problem: Regression) -> Iterator[tuple[str, bool, dict[str, np.ndarray]]]:
+    """Mistakes with their hint, whether a fit would be in vain, and the changes of `remains` that correct them."""
+    names, inputs, motion, eye = rig.input_columns, problem.inputs, problem.motion, np.eye(len(problem.size))
     slopes = gains(problem)
-    if text := "; ".join(_in_other_units(rig, system, slopes)):
-        yield Explanation(problem.remains(slopes * problem.inputs), text)
-    yield from _coasting(rig, problem)
+    if text := "; ".join(_in_other_units(rig, problem.system, slopes)):
+        yield text, True, {"inputs": slopes * inputs}
+    if coasting := [name for i, name in enumerate(names) if motion.braking[..., i].any()]:
+        text = f'{" and ".join(coasting)}: at 0 V the drive does not brake, it coasts, and kind = "voltage" has its '
+        text += "back-EMF there, too: set the driver to brake, or leave rows at 0 V out"
+        yield text, False, {"inputs": inputs - _by_joint(motion.braking, motion.direct[problem.driven])[problem.rows]}
     for i, j in itertools.combinations(range(len(names)), 2):
         order = np.arange(len(names))
         order[[i, j]] = j, i
-        text = f"{names[i]} and {names[j]} are swapped: exchange the columns"
-        yield Explanation(problem.remains(problem.inputs[:, order]), text)
-    yield from _weightless(rig, problem)
-    for name, rate, axis in zip(system.coordinates, system.rates, eye, strict=True):
+        yield f"{names[i]} and {names[j]} are swapped: exchange the columns", True, {"inputs": inputs[:, order]}
+    without = _weightless(problem)
+    if weightless := [name for name, joint in zip(names, problem.driven, strict=True) if without[joint]]:
+        text = f"{' and '.join(weightless)}: the gravity of the declared bodies is not in it: log the whole torque of "
+        text += "the motor, with what a controller adds against gravity; or a spring or counterweight bears it"
+        yield text, False, {"gravity": 1.0 - without}
+    for name, rate, axis in zip(problem.system.coordinates, problem.system.rates, eye, strict=True):
         text = f"{name} counts in the other direction than that of the machine: multiply it by -1, and {rate}"
-        yield Explanation(problem.remains(sign=1 - 2 * axis), text)
+        yield text, True, {"sign": 1 - 2 * axis}
     for joint, bias in _zeros(problem):
-        text = f"{system.coordinates[joint]} reads {bias:.3g} rad ({np.degrees(bias):.3g} degrees) more than it is: "
-        text += "subtract that" + ", or level the base, which is tilted by the opposite" * (joint == 0)
-        yield Explanation(problem.remains(shift=bias * eye[joint]), text, ruins=False)
+        text = f"{problem.system.coordinates[joint]} reads {bias:.3g} rad ({np.degrees(bias):.3g} degrees) more than "
+        text += "it is: subtract that" + ", or level the base, which is tilted by the opposite" * (joint == 0)
+        yield text, False, {"shift": bias * eye[joint]}
 
 
 def gains(problem: Regression) -> Float[np.ndarray, " input"]:
     """Slope of the needed torque by every input; declared numbers are held, or all would shrink together."""
-    out, needed = np.ones(problem.inputs.shape[1]), problem.beyond(problem.plain.sum(axis=0))
-    for joint in set(problem.system.joints):
-        of = [i for i, at in enumerate(problem.system.joints) if at == joint]
-        columns = [problem.beyond(np.outer(problem.inputs[:, i], np.ones(needed.shape[1])))[:, joint - 1] for i in of]
-        out[of] = np.linalg.lstsq(np.stack(columns, axis=1), needed[:, joint - 1], rcond=None)[0]
-    return out
+    needed, fed = problem.beyond(problem.plain.sum(axis=0)), problem.beyond(problem.applied(problem.inputs))
+    return (np.sum(fed * needed, axis=0) / np.maximum(np.sum(fed**2, axis=0), 1e-300))[problem.driven]
 
 
 def lag(problem: Regression, i: int) -> Lag:
@@ -303,20 +307,17 @@ def lag(problem: Regression, i: int) -> Lag:
 
     The best whole number of rows, then one step of Gauss and Newton.
     """
-    joint, motion, torque = problem.system.joints[i] - 1, problem.motion, problem.motion.torque[..., i]
-    others = problem.parts(slopes=True).sum(axis=0)[:, joint] * problem.std
-    rest = problem.plain.sum(axis=0)[:, joint] - (problem.applied(problem.inputs)[:, joint] - problem.inputs[:, i])
+    joint, motion, torque = problem.driven[i], problem.motion, problem.motion.torque[..., i]
+    free = np.concatenate([problem.friction[joint], problem.parts(slopes=True).sum(axis=0)[:, joint]], axis=1)
     far = np.pad(torque, ((0, 0), (REACH, REACH)), constant_values=np.nan)
     shifts = range(-REACH, REACH + 1)
     late = [filtered(far[:, REACH - k :][:, : torque.shape[1]], motion.direct[joint])[problem.rows] for k in shifts]
     inside = np.isfinite(late).all(axis=0)
     if inside.sum() < FILTERED_ROWS:
         return Lag(0.0, math.inf, 1.0)
-    late, rest = np.stack(late)[:, inside], rest[inside]
-    free = _directions(np.concatenate([problem.friction[joint], others], axis=1)[inside])
-    misfits = [rest - torque for torque in late]
-    misfits = [error - free @ (free.T @ error) for error in misfits]
-    best = 1 + int(np.argmin([float(error @ error) for error in misfits[1:-1]]))
+    misfits, free = (problem.plain.sum(axis=0)[:, joint] - late)[:, inside], _directions(free[inside])
+    misfits -= (misfits @ free) @ free.T
+    best = 1 + int(np.argmin(np.sum(misfits[1:-1] ** 2, axis=1)))
     moved = 0.5 * (misfits[best - 1] - misfits[best + 1])
     size = float(moved @ moved) + 1e-300
     rows = float(moved @ misfits[best]) / size
@@ -339,29 +340,13 @@ def _in_other_units(rig: Rig, system: AbstractSystem, slopes: Float[np.ndarray, 
             yield f"{text}; or masses and lengths are not in kg and m"
 
 
-def _coasting(rig: Rig, problem: Regression) -> Iterator[Explanation]:
-    """Voltage drives without back-EMF while their command is 0."""
-    motion = problem.motion
-    names = [name for i, name in enumerate(rig.input_columns) if np.any((motion.coasting != motion.torque)[..., i])]
-    if names:
-        text = f'{" and ".join(names)}: at 0 V the drive does not brake, it coasts, and kind = "voltage" has its '
-        text += "back-EMF there, too: set the driver to brake, or leave rows at 0 V out"
-        inputs = motion.filtered_inputs(problem.system, motion.coasting)[problem.rows]
-        yield Explanation(problem.remains(inputs), text, ruins=False)
-
-
-def _weightless(rig: Rig, problem: Regression) -> Iterator[Explanation]:
-    """Torques without the gravity of some joints."""
+def _weightless(problem: Regression) -> Bool[np.ndarray, " dof"]:
+    """Joints whose torque holds none of the declared gravity."""
     inertia, velocity, gravity = problem.plain
     rest, weight = problem.beyond(inertia + velocity - problem.applied(problem.inputs)), problem.beyond(gravity)
     share = -np.sum(rest * weight, axis=0) / np.maximum(np.sum(weight**2, axis=0), 1e-300)
     carried = 0.3  # share of the declared gravity below which a torque holds none of it
-    without = (np.abs(share) < carried) & (np.std(weight, axis=0) > 0)
-    names = [name for name, joint in zip(rig.input_columns, problem.system.joints, strict=True) if without[joint - 1]]
-    if names:
-        text = f"{' and '.join(names)}: the gravity of the declared bodies is not in it: log the whole torque of the "
-        text += "motor, with what a controller adds against gravity; or a spring or counterweight bears it"
-        yield Explanation(problem.remains(gravity=1.0 - without), text, ruins=False)
+    return (np.abs(share) < carried) & (np.std(weight, axis=0) > 0)
 
 
 TURNS = 5
@@ -397,16 +382,15 @@ def mistakes(found: Iterable[Explanation], plain: Float[np.ndarray, " dof"]) -> 
 
 
 @eqx.filter_jit
-def _torques(system: AbstractSystem, mean: dict[str, Array], q, v, a, *, slopes: bool):
-    """Torques of inertia, velocities and gravity by row, or their slopes by the numbers of `mean`."""
+def _torques(system: AbstractSystem, prior: ParameterPrior, moved, share, q, v, a, *, slopes: bool):
+    """Torques of inertia, velocities and gravity by row, or their slopes by numbers that are so far from their mean."""
 
-    def torques(values, q, v, a):
-        machine = system.with_parameters(dict(zip(mean, values, strict=True))) if mean else system
+    def torques(moved, q, v, a):
+        machine = prior.write(system, moved)
         gravity = machine.bias(q, jnp.zeros_like(v))
-        return jnp.stack([machine.mass(q) @ a, machine.bias(q, v) - gravity, gravity])
+        return jnp.stack([machine.mass(q) @ a, machine.bias(q, v) - gravity, share * gravity])
 
-    values = jnp.stack(list(mean.values())) if mean else jnp.zeros(0)
-    return jax.vmap(jax.jacfwd(torques) if slopes else torques, (None, 0, 0, 0))(values, q, v, a)
+    return jax.vmap(jax.jacfwd(torques) if slopes else torques, (None, 0, 0, 0))(moved, q, v, a)
 
 
 def filtered(x: Float[np.ndarray, "piece time *any"], taps: Float[np.ndarray, " tap"]) -> np.ndarray:
@@ -415,14 +399,8 @@ def filtered(x: Float[np.ndarray, "piece time *any"], taps: Float[np.ndarray, " 
 
 
 def _by_joint(x: Float[np.ndarray, "piece time joint *any"], taps: Float[np.ndarray, "joint tap"]) -> np.ndarray:
-    parts = [filtered(x[:, :, j], one) for j, one in enumerate(taps)]
-    return np.stack(parts, axis=2) if parts else np.zeros((len(x), x.shape[1] - taps.shape[1] + 1, 0))
-
-
-def _derivative(order: int, dt: float) -> Float[np.ndarray, " tap"]:
-    """Weights of the derivative of a polynomial in a window [Savitzky & Golay 1964, Analytical Chemistry 36(8)]."""
-    powers = np.vander(np.arange(-(WIDTH // 2), WIDTH // 2 + 1) * dt, ORDER + 1, increasing=True)
-    return math.factorial(order) * np.linalg.pinv(powers)[order]
+    """`filtered`, of every joint with weights of its own."""
+    return np.einsum("ptj...w,jw->ptj...", np.lib.stride_tricks.sliding_window_view(x, taps.shape[1], axis=1), taps)
 
 
 def _pieces(values: Float[np.ndarray, "seq time column"], valid: Bool[np.ndarray, "seq time"]) -> np.ndarray:
@@ -446,7 +424,4 @@ def _hats(v: Float[np.ndarray, "piece time"]) -> Float[np.ndarray, "piece time n
 
 def _directions(columns: Float[np.ndarray, "row column"]) -> Float[np.ndarray, "row direction"]:
     """Orthonormal directions of the columns, without those that the log hardly has."""
-    columns = columns / (np.linalg.norm(columns, axis=0) + 1e-300)
-    squares, axes = np.linalg.eigh(columns.T @ columns)
-    kept = squares > 1e-8 * squares[-1]
-    return columns @ (axes[:, kept] / np.sqrt(squares[kept]))
+    return np.asarray(orth(columns / (np.linalg.norm(columns, axis=0) + 1e-300), rcond=1e-4))

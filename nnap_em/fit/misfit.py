@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -79,11 +79,6 @@ class Misfit(NamedTuple):
     useless: bool
     readings: tuple[Accuracy, ...] = ()
 
-    @property
-    def document(self) -> dict[str, Any]:
-        """The entry of report.json."""
-        return self._asdict() | {"readings": [one._asdict() for one in self.readings]}
-
 
 def misfit(rows: Sequence[tuple], *, settled: bool = True) -> Misfit:
     """The word on a fit with this accuracy, of the reading that is predicted worst."""
@@ -99,36 +94,34 @@ def ahead(
     rig: Rig, model: StateSpaceModel, error: Float[np.ndarray, "seq start horizon obs"], data: Dataset
 ) -> tuple[Accuracy, ...]:
     """Accuracy of a model with the `errors` of its predictions, over the horizons at which it is judged."""
-    dof, starts, places = len(model.system.coordinates), grid_along(model, data, JUDGED), channels(model)
+    dof, grid, places = len(model.system.coordinates), grid_along(model, data, JUDGED), channels(model)
     y = np.asarray(data.y)[..., places]
-    rows = starts.starts(y.shape[1])
-    change = np.stack([y[:, rows + age] - y[:, rows] for age in starts.ages], axis=2)
-    kick, moving = np.exp(0.5 * np.asarray(model.log_q)), measure_scales(rig, model.system, data).acceleration
-    pushed = [float(kick[dof + joint] / rig.dt / moving[joint]) for joint in range(dof)]
-    of = [pushed[model.measured[place] % dof] if model.measured[place] < 2 * dof else 0.0 for place in places]
-    return _rows(rig, model, data, places, [age * rig.dt for age in starts.ages], (error, change), of)
+    rows = grid.starts(y.shape[1])
+    change = np.stack([y[:, rows + age] - y[:, rows] for age in grid.ages], axis=2)
+    kick = np.exp(0.5 * np.asarray(model.log_q)[dof : 2 * dof]) / rig.dt
+    pushed = 2 * (kick / measure_scales(rig, model.system, data).acceleration).tolist()  # by coordinate, then by rate
+    return _rows(rig, model, data, places, tuple(age * rig.dt for age in grid.ages), error, change, pushed)
 
 
 def simulating(rig: Rig, model: StateSpaceModel, error: Errors, data: Dataset) -> tuple[Accuracy, ...]:
     """Accuracy of free simulations of equations."""
-    y, places = np.asarray(data.y), range(len(rig.measured))
-    both = error[..., None, :], (y - np.nanmean(y, axis=(0, 1)))[..., None, :]
-    return _rows(rig, model, data, places, (), both, [0.0] * len(places))
+    y = np.asarray(data.y)
+    spread = (y - np.nanmean(y, axis=(0, 1)))[..., None, :]
+    return _rows(rig, model, data, range(len(rig.measured)), (), error[..., None, :], spread, [])
 
 
-def _rows(rig: Rig, model, data: Dataset, places, seconds, both, pushed) -> tuple[Accuracy, ...]:
+def _rows(rig: Rig, model, data: Dataset, places, seconds, error, change, pushed) -> tuple[Accuracy, ...]:
     """Root mean squares of errors and motion by reading; a reading without any is left out."""
     out = []
-    for i, place in enumerate(places):
-        wide, moved = (tuple(_size(a[..., h, i]) for h in range(a.shape[-2])) for a in both)
+    for i, (name, place) in enumerate((rig.measured[place], place) for place in places):
+        wide, moved = (tuple(map(_size, part[..., i].reshape(-1, part.shape[-2]).T)) for part in (error, change))
         noise = max(math.exp(0.5 * float(model.log_r[place])), reading_noise(np.asarray(data.y)[..., place]))
-        name = rig.measured[place]
-        row = Accuracy(name, rig.unit(name), tuple(seconds), wide, moved, noise, pushed[i])
-        out += [row] * math.isfinite(sum(wide + moved))
-    return tuple(out)
+        push = dict(enumerate(pushed)).get(model.measured[place], 0.0)
+        out += [Accuracy(name, rig.unit(name), seconds, wide, moved, noise, push)]
+    return tuple(row for row in out if math.isfinite(sum(row.error + row.motion)))
 
 
-def _size(values: np.ndarray) -> float:
+def _size(values: Float[np.ndarray, " value"]) -> float:
     known = values[~np.isnan(values)]
     return math.sqrt(np.mean(np.clip(known, -RUNAWAY, RUNAWAY) ** 2)) if known.size else math.nan
 

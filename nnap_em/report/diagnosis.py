@@ -75,7 +75,7 @@ def write_diagnosis(
     document = shared(diagnosis.before, train, test, seed=seed, began=began) | {
         "verdict": " ".join([outcome, *[misfit.text] * bool(misfit.text), *(one.sentence for one in far)]),
         "misfit": [misfit.text] if misfit.useless else [],
-        "accuracy": {name: fitted.misfit.document for name, fitted in both.items()},
+        "accuracy": {name: fitted.misfit for name, fitted in both.items()},
         "moved": far,
         "complete": diagnosis.complete,
         "since_fit": {"risen": diagnosis.risen} if diagnosis.change else None,

@@ -72,7 +72,7 @@ def write_identification(
     document = shared(fitted, train, test, seed=seed, began=began) | {
         "verdict": _verdict(fitted, len(train.files), len(entries[-1]["left_out"]), causes, far),
         "misfit": [misfit.text, *causes] if misfit.useless else [],
-        "accuracy": misfit.document,
+        "accuracy": misfit,
         "moved": far,
         "fit": error and {name: error[name] for name in ("given_s", "horizons_s")} | error["fit"],
         "error": error,
@@ -120,7 +120,7 @@ def _stopped_early(fitted: Identified) -> str:
 
 
 def _log_summary(document: dict[str, Any], log: Log) -> None:
-    lines = [document["verdict"]] if document["accuracy"]["text"] or document["moved"] else []
+    lines = [document["verdict"]] if document["accuracy"].text or document["moved"] else []
     lines += [*(law["text"] for law in document["friction_law"] or []), document["stopped"]]
     if document["left_out"]:
         lines.append(f"diverged, and left out of the last epoch: {listed(document['left_out'])}")

@@ -133,7 +133,7 @@ changes that are not corrected for their number
 sign of friction
 - known + torque
 + known - torque
-# systems/base.py
+# systems/plant.py
 ## test_systems.py::test_energy_changes_by_the_work_of_the_input[slide]
 sign of the input
 - force[joint - 1] + u[i]

@@ -100,7 +100,7 @@ def test_what_a_drive_does_to_the_line_between_rows_at_once_and_row_by_row(name,
     rows, whole = jax.jit(
         lambda u: (
             jax.lax.scan(step, stream.memory, (u, first))[1],
-            hooks.reaching((effect,), system, u, LINES),
+            hooks.arriving((effect,), None, system, u, LINES.through)[0],
         )
     )(jnp.asarray(u)[:, None])
     np.testing.assert_allclose(rows[:, 0], truth(u, number), atol=1e-12)

@@ -6,11 +6,10 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..effects.actuator import InputDelay
 from ..effects.base import AbstractEffect, OperatingPoint, Scalar, Stream
 from ..systems.base import AbstractSystem
 from ..systems.plant import AbstractPlant
-from .servo import LAWS, Servo
+from .servo import Servo
 
 Effects = Sequence[AbstractEffect]
 
@@ -23,15 +22,18 @@ class Sampling(NamedTuple):
     smooth: bool = False
     """True where an input goes on from row to row; False where it is held."""
 
-    def through(self, effect: AbstractEffect, u: Float[Array, " time"]) -> Float[Array, " time"]:
-        """An input that was 0 before its first row, after a law that takes time.
+    def through(self, effect: AbstractEffect, u: Float[Array, " time"], stood: bool) -> Float[Array, " time"]:
+        """An input after a law that takes time; before its first row it `stood` as in it, or was 0.
 
         Held: its mean over each interval.  Smooth: its values in the rows, by the law of the slopes of lines between
         them; it stood before the first row as in it.
         """
-        if not self.smooth or type(effect).input is AbstractEffect.input:
-            return effect.input(u, self.dt)
-        return jnp.concatenate([u[:1], u[:1] + jnp.cumsum(effect.input(jnp.diff(u), self.dt))])
+        if _at_once(effect):
+            return u
+        if self.smooth:
+            return jnp.concatenate([u[:1], u[:1] + jnp.cumsum(effect.input(jnp.diff(u), self.dt))])
+        before = u[:1] if stood else jnp.zeros_like(u[:1])
+        return before + effect.input(u - before, self.dt)
 
     def stream(self, effect: AbstractEffect) -> Stream | None:
         """`through` row by row; the memory of a smooth one ends in the value before, and in what became of it."""
@@ -57,106 +59,98 @@ class CommandStream(NamedTuple):
     that the commands set (`Inputs.u`)."""
 
 
-def reaching(
-    effects: Effects, system: AbstractPlant, u: Float[Array, "time input"], rows: Sampling
-) -> Float[Array, "time input"]:
-    """Torques at the joints of the commanded torques of a sequence [N m]."""
-    for effect in effects:
-        if (i := system.input_of(effect.joint, effect.channel)) is not None:
-            late = system.late(lambda column, effect=effect: rows.through(effect, column), u[:, i])
-            u = u.at[:, i].set(effect.drive(late))
-    return u
+def _at_once(effect: AbstractEffect) -> bool:
+    """True of a law that takes no time."""
+    return type(effect).input is AbstractEffect.input
 
 
-def fed(
+def arriving(
     effects: Effects,
-    servos: Sequence[Servo],
-    system: AbstractSystem,
-    u: Float[Array, "time input"],
-    rows: Sampling,
-    scale: Float[Array, "time column"] | None = None,
-) -> Float[Array, "time input"]:
-    """Values that the commands of a sequence set in its drives, with the effects that take time (`Servo.fed`).
+    servos: Sequence[Servo] | None,
+    system: AbstractPlant,
+    u: Float[Array, "*time column"],
+    through: Callable[..., Array],
+) -> tuple[Float[Array, "*time input"], Float[Array, "*time column"] | None]:
+    """What the input columns of a sequence, or of one row, set at the drives, with the effects that take time.
 
-    `scale` are the columns that numbers of the servos are proportional to (`Servo.at`).
+    Torques at the joints [N m], or of servos what commands set in them (`Servo.fed`).  Beside it the columns that
+    numbers of the servos are proportional to (`Servo.at`).  `through` is that of `Sampling`, or the same row by row.
     """
-    values = jnp.stack([servo.at(scale).fed(u[:, i], rows.through) for i, servo in enumerate(servos)], axis=1)
-    return late(effects, servos, system, values, rows)
+    drives = len(system.drives)
+    u, scale = u[..., :drives], u[..., drives:] if u.shape[-1] > drives else None
+    if servos:
+        u = jnp.stack([servo.at(scale).fed(u[..., i], through) for i, servo in enumerate(servos)], axis=-1)
+    return late(effects, servos, system, u, through), scale
 
 
 def late(
-    effects: Effects, servos: Sequence[Servo], system: AbstractSystem, fed: Float[Array, "time input"], rows: Sampling
-) -> Float[Array, "time input"]:
-    """Values at the drives of those that commands set, with the effects that take time."""
+    effects: Effects,
+    servos: Sequence[Servo] | None,
+    system: AbstractPlant,
+    u: Float[Array, "*time input"],
+    through: Callable[..., Array],
+) -> Float[Array, "*time input"]:
+    """Values at the drives of those that commands set, with the effects that take time; of torques all effects."""
     columns = []
-    for joint, servo, column in zip(system.joints, servos, fed.T, strict=True):
-        before = servo.before(column)
+    for i, place in enumerate(system.drives):
+        column, stood = u[..., i], servos[i].feeds_back if servos else "channel" in place
         for effect in effects:
-            if effect.joint == joint:
-                column = before + rows.through(effect, column - before)
+            if all(getattr(effect, key) == value for key, value in place.items()):
+                column = through(effect, column, stood)
+                column = column if servos else effect.drive(column)
         columns.append(column)
-    return jnp.stack(columns, axis=1)
+    return jnp.stack(columns, axis=-1) if columns else u
 
 
 def command_stream(
-    effects: Effects, servos: Sequence[Servo] | None, system: AbstractSystem, rows: Sampling
+    effects: Effects, servos: Sequence[Servo] | None, system: AbstractPlant, rows: Sampling
 ) -> CommandStream:
-    """`reaching` or `fed` row by row.
+    """`arriving` row by row; of each law that takes time the input before the first row and its own memory are kept.
 
     Raises ValueError where a law of the command has no form for one row.
     """
-    lines = [_line(effects, servos[i] if servos else None, joint, rows) for i, joint in enumerate(system.joints)]
+    streams: list[Stream] = []
+
+    def begun(effect, u, stood):
+        if not _at_once(effect):
+            if (stream := rows.stream(effect)) is None:
+                raise ValueError(f"{effect.name!r} has no form for one row: give it `stream` beside `input`")
+            streams.append(stream)
+        return u
 
     def step(memory, u, first):
-        scale = u[len(lines) :] if u.shape[0] > len(lines) else None
-        passed = [line(own, u[i], scale, first) for i, ((_, line), own) in enumerate(zip(lines, memory, strict=True))]
-        return tuple(own for own, _ in passed), jnp.stack([fed for _, fed in passed]) if passed else u
+        after = []
 
-    return CommandStream(tuple(memory for memory, _ in lines), step)
-
-
-def _line(effects: Effects, servo: Servo | None, joint: int, rows: Sampling) -> tuple[Any, Callable[..., Any]]:
-    """Memory and step of one drive: the command as in the first row, what it set, then the memory of each law."""
-    laws = [(effect, rows.stream(effect)) for effect in effects if effect.joint == joint]
-    for effect, stream in laws:
-        if stream is None and type(effect).input is not AbstractEffect.input:
-            raise ValueError(f"{effect.name!r} has no form for one row: give it `stream` beside `input`")
-    delay = rows.stream(InputDelay(servo.values["delay"], joint=0)) if servo and "delay" in servo.values else None
-    streams = [stream for stream in (delay, *(stream for _, stream in laws)) if stream]
-
-    def step(memory, u, scale, first):
-        (begun, stood, *before), after = memory, []
-
-        def through(stream, value, base):
-            memory = before[len(after)]
+        def through(effect, u, stood):
+            if _at_once(effect):
+                return u
+            before, own = memory[len(after)]
+            before = jnp.where(first, u, before) if stood else before
             if rows.smooth:  # before the first row the input stood as in it
-                memory = jnp.where(first, memory.at[-2:].set(value - base), memory)
-            own, late = stream.step(memory, value - base)
-            after.append(own)
-            return base + late
+                own = jnp.where(first, own.at[-2:].set(u - before), own)
+            own, late = streams[len(after)].step(own, u - before)
+            after.append((before, own))
+            return before + late
 
-        if servo:
-            begun = jnp.where(first, u, begun)
-            u = LAWS[servo.kind].feed(servo.at(scale).values, through(delay, u, begun) if delay else u)
-            stood = jnp.where(first, u, stood) if servo.feeds_back else stood
-        for effect, stream in laws:
-            u = through(stream, u, stood) if stream else u
-            u = u if servo else effect.drive(u)
-        return (begun, stood, *after), u
+        fed, _ = arriving(effects, servos, system, u, through)
+        return tuple(after), fed
 
-    return (jnp.zeros(()), jnp.zeros(()), *(stream.memory for stream in streams)), step
+    arriving(effects, servos, system, jnp.zeros(len(system.drives)), begun)
+    return CommandStream(tuple((jnp.zeros(()), stream.memory) for stream in streams), step)
 
 
 def driven(
     effects: Effects,
-    servos: Sequence[Servo],
+    servos: Sequence[Servo] | None,
     system: AbstractSystem,
     u: Float[Array, " input"],
     q: Float[Array, " dof"],
     v: Float[Array, " dof"],
     scale: Float[Array, " column"] | None = None,
 ) -> Float[Array, " input"]:
-    """Torque of every drive at one moment, with the effects that take none [N m, before the gear]."""
+    """Torque of every drive at one moment, with the effects that take none [N m, before the gear]; or `u`."""
+    if not servos:
+        return u
     torques = []
     for i, (joint, gear, servo) in enumerate(zip(system.joints, system.gears, servos, strict=True)):
         torque = servo.at(scale).torque(u[i], gear * q[joint - 1], gear * v[joint - 1])

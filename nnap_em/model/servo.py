@@ -78,19 +78,14 @@ class Servo(eqx.Module):
         """True where the torque depends on the motion."""
         return self.kind != "torque"
 
-    def fed(self, u: Float[Array, " time"], through: Callable[..., Array]) -> Float[Array, " time"]:
-        """Values that the commands of a sequence set, in every row [N m, or N; of a damper N m s/rad or N s/m].
+    def fed(self, u: Float[Array, "*time"], through: Callable[..., Array]) -> Float[Array, "*time"]:
+        """Values that the commands of a sequence, or of one row, set [N m, or N; of a damper N m s/rad or N s/m].
 
         `through` is that of `hooks.Sampling`.
         """
         if "delay" in self.values:
-            first = u[:1]
-            u = first + through(InputDelay(self.values["delay"], joint=0), u - first)
+            u = through(InputDelay(self.values["delay"], joint=0), u, True)
         return LAWS[self.kind].feed(self.values, u)
-
-    def before(self, fed: Float[Array, " time"]) -> Float[Array, " 1"]:
-        """Value that was set before the first row."""
-        return fed[:1] if self.feeds_back else jnp.zeros_like(fed[:1])
 
     def torque(self, fed: Scalar, q: Scalar, v: Scalar) -> Scalar:
         """Torque at one moment [N m, or N], at a coordinate [rad, or m] and a rate."""

@@ -3,7 +3,6 @@
 import dataclasses
 import math
 from collections.abc import Callable, Sequence
-from functools import partial
 from typing import Any, NamedTuple, cast
 
 import equinox as eqx
@@ -101,13 +100,8 @@ class StateSpaceModel(AbstractModel):
 
     def inputs(self, seq: Dataset) -> Inputs:
         """External inputs in every row, as the effects change them."""
-        u, t, scale = jnp.asarray(seq.u), jnp.asarray(seq.t), None
-        if self.servos:
-            drives = len(self.servos)
-            scale = u[:, drives:] if u.shape[1] > drives else None
-            u = hooks.fed(self.effects, self.servos, self.system, u[:, :drives], self.rows, scale)
-        else:
-            u = hooks.reaching(self.effects, self.system, u, self.rows)
+        t = jnp.asarray(seq.t)
+        u, scale = hooks.arriving(self.effects, self.servos, self.system, jnp.asarray(seq.u), self.rows.through)
         along = course(u, jnp.asarray(seq.valid)) if self.smooth else None
         return Inputs(u, jnp.concatenate([jnp.zeros_like(u[:1]), u[:-1]]), t + 0.5 * self.dt, t - t[:1], scale, along)
 
@@ -115,7 +109,7 @@ class StateSpaceModel(AbstractModel):
         """State of the machine at one moment, as effects get it."""
         q, v = self.system.split(x)
         system = hooks.machine(self.effects, self.system, u.time)
-        torque = hooks.driven(self.effects, self.servos, system, u.u, q, v, u.scale) if self.servos else u.u
+        torque = hooks.driven(self.effects, self.servos, system, u.u, q, v, u.scale)
         friction = system.at_ports(self.unknown(v))
         return OperatingPoint(system, q, v, system.drive(torque), u.time, friction, self.unknown, torque)
 
@@ -123,17 +117,13 @@ class StateSpaceModel(AbstractModel):
         self, effects: Sequence[AbstractEffect], x: Float[Array, "time state"], u: Inputs
     ) -> Float[Array, "time dof"]:
         """Generalised force of the inputs along states in the middle of the steps, with `effects` on top [N m]."""
-        servos, dof = self.servos, len(self.system.coordinates)
-        arrive = partial(hooks.late, effects, servos) if servos else partial(hooks.reaching, effects)
-        fed = arrive(self.system, u.u, self.rows)
+        fed = hooks.late(effects, self.servos, self.system, u.u, self.rows.through)
         if u.course is not None:
             fed = 0.5 * (fed + jnp.concatenate([fed[1:], fed[-1:]])) - u.course[:, 1] / 8
-        if not servos:
-            return jax.vmap(self.system.drive)(fed)
 
         def at(x: Float[Array, " state"], fed: Float[Array, " input"], scale) -> Float[Array, " dof"]:
-            q, v = x[:dof], x[dof : 2 * dof]
-            return self.system.drive(hooks.driven(effects, servos, self.system, fed, q, v, scale))
+            q, v = self.system.split(x)
+            return self.system.drive(hooks.driven(effects, self.servos, self.system, fed, q, v, scale))
 
         return jax.vmap(at)(x, fed, u.scale)
 
@@ -162,7 +152,10 @@ class StateSpaceModel(AbstractModel):
 
         Max over joints and poses of dt (M^-1)_jj |d tau_j / d v_j|.
         """
-        fastest = self.dt * np.max(self.system.mobility() * np.asarray(cast(Any, self.unknown).steepest()))
+        steepest = np.asarray(cast(Any, self.unknown).steepest())
+        if not steepest.any():  # no map is learned
+            return self
+        fastest = self.dt * np.max(self.system.mobility() * steepest)
         # Integration step as the fastest time in which learned friction ends a motion: the classical
         # Runge-Kutta method errs by a percent there, in a thin layer near rest, and is unstable from 2.8 on
         steps = min(MOST_STEPS, 2 ** math.ceil(math.log2(max(float(fastest), 1.0))))

@@ -39,11 +39,6 @@ class AbstractSystem(AbstractPlant):
     def with_parameters(self, values: Mapping[str, Array]) -> "AbstractSystem":
         return dataclasses.replace(self, **values)
 
-    @property
-    def gears(self) -> tuple[float, ...]:
-        """Generalised force of a unit of every input."""
-        return (1.0,) * len(self.joints)
-
     def neighbours(self, joint: int) -> tuple[int, ...]:
         """Joints, counted from 1, that share a body with this one, and itself."""
         return tuple(j for j in (joint - 1, joint, joint + 1) if 1 <= j <= len(self.coordinates))
@@ -66,14 +61,8 @@ class AbstractSystem(AbstractPlant):
     def port_unit(self, port: int) -> str:
         return self.force_unit(port)
 
-    def input_of(self, joint: int | None, channel: str | None) -> int | None:
-        return self.joints.index(joint) if joint in self.joints else None
-
-    def split(self, x: Float[Array, " state"]) -> tuple[Float[Array, " dof"], Float[Array, " dof"]]:
-        dof = len(self.coordinates)
-        return x[:dof], x[dof : 2 * dof]
-
     def mobility(self) -> Float[np.ndarray, " dof"]:
+        """Largest acceleration of every joint by a unit of its own torque."""
         q = jnp.asarray(np.random.default_rng(0).uniform(-np.pi, np.pi, (32, len(self.coordinates))), float)
         return np.max(np.asarray(_mobility(self, q)), axis=0)
 
@@ -84,12 +73,6 @@ class AbstractSystem(AbstractPlant):
     def drives(self) -> list[dict[str, Any]]:
         return [{"joint": joint} for joint in self.joints]
 
-    def late(self, law, u):
-        return law(u)
-
-    def at_ports(self, torque: Float[Array, " dof"]) -> Float[Array, " dof"]:
-        return torque
-
     @abstractmethod
     def mass(self, q: Float[Array, " dof"]) -> Float[Array, "dof dof"]:
         """Mass matrix M(q) [kg m^2, or kg on a slide]."""
@@ -97,13 +80,6 @@ class AbstractSystem(AbstractPlant):
     @abstractmethod
     def bias(self, q: Float[Array, " dof"], v: Float[Array, " dof"]) -> Float[Array, " dof"]:
         """Coriolis, centrifugal and gravity force c(q, q') [N m, or N]."""
-
-    def drive(self, u: Float[Array, " input"]) -> Float[Array, " dof"]:
-        """Generalised force B u of the inputs [N m, or N]."""
-        force = [jnp.zeros((), u.dtype)] * len(self.coordinates)
-        for i, (joint, gear) in enumerate(zip(self.joints, self.gears, strict=True)):
-            force[joint - 1] = force[joint - 1] + u[i] * gear
-        return jnp.stack(force)
 
     def acceleration(
         self, q: Float[Array, " dof"], v: Float[Array, " dof"], force: Float[Array, " dof"]

@@ -9,7 +9,6 @@ from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from ..data.units import quantities
@@ -123,30 +122,9 @@ class Equations(AbstractPlant):
         unit = self.unit(name)
         return (f"{unit}/s" if unit else "1/s") if name in self.of.states else unit
 
-    def input_of(self, joint: int | None, channel: str | None) -> int | None:
-        return self.inputs.index(channel) if channel in self.inputs else None
-
-    def split(self, x: Float[Array, " state"]) -> tuple[Float[Array, " dof"], Float[Array, " rate"]]:
-        return x[: len(self.of.states)], x[:0]
-
-    def drive(self, u: Float[Array, " input"]) -> Float[Array, " port"]:
-        return jnp.zeros(len(self.ports), u.dtype)
-
-    def mobility(self) -> Float[np.ndarray, " port"]:
-        return np.zeros(len(self.ports))
-
-    def push_of(self, q: Float[Array, " dof"], change: Float[Array, "node state"]) -> Float[Array, "node state"]:
-        return change
-
     @property
     def drives(self) -> list[dict[str, Any]]:
         return [{"channel": name} for name in self.of.inputs]
-
-    def late(self, law, u):
-        return u[0] + law(u - u[0])
-
-    def at_ports(self, torque: Float[Array, " dof"]) -> Float[Array, " port"]:
-        return jnp.zeros(len(self.ports), torque.dtype)
 
     def named(
         self, q: Float[Array, " dof"], u: Float[Array, " input"], push: Float[Array, " port"] | None = None

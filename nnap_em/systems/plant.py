@@ -2,11 +2,11 @@
 
 import math
 from abc import abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import equinox as eqx
-import numpy as np
+import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 Scalar = Float[Array, ""]
@@ -87,40 +87,39 @@ class AbstractPlant(eqx.Module):
     def port_unit(self, port: int) -> str:
         """Unit of the push at a port, counted from 1."""
 
-    @abstractmethod
-    def input_of(self, joint: int | None, channel: str | None) -> int | None:
-        """Index of the input that drives a joint, or that has a name; None where there is none."""
-
-    @abstractmethod
     def split(self, x: Float[Array, " state"]) -> tuple[Float[Array, " dof"], Float[Array, " rate"]]:
         """The parts (q, v) of a state that memory of effects may follow."""
+        states = len(self.states)
+        places = states - len(self.rates)
+        return x[:places], x[places:states]
 
-    @abstractmethod
+    @property
+    def gears(self) -> tuple[float, ...]:
+        """Generalised force of a unit of the input of every joint that is driven."""
+        return (1.0,) * len(self.joints)
+
     def drive(self, u: Float[Array, " input"]) -> Float[Array, " port"]:
-        """Push of the inputs at the ports; 0 where inputs stand in the equations themselves."""
+        """Push B u of the inputs at the ports [N m, or N]; 0 where inputs stand in the equations themselves."""
+        force = [jnp.zeros((), u.dtype)] * len(self.ports)
+        for i, (joint, gear) in enumerate(zip(self.joints, self.gears, strict=True)):
+            force[joint - 1] = force[joint - 1] + u[i] * gear
+        return jnp.stack(force)
 
-    @abstractmethod
-    def mobility(self) -> Float[np.ndarray, " dof"]:
-        """Largest acceleration of every joint by a unit of its own torque; 0 without joints."""
+    def at_ports(self, torque: Float[Array, " dof"]) -> Float[Array, " port"]:
+        """Torques of the learned maps of the joints, which equations have none of, as pushes at all ports."""
+        return jnp.pad(torque, (0, len(self.ports) - torque.shape[0]))
 
-    @abstractmethod
     def push_of(self, q: Float[Array, " dof"], change: Float[Array, "node rate"]) -> Float[Array, "node rate"]:
         """Impulse that changes the rates of a machine so, or the change itself, of states of equations."""
+        return change
 
     @property
     @abstractmethod
     def drives(self) -> list[dict[str, Any]]:
-        """Joint of every input, or its name as a channel: columns behind these scale numbers of servos."""
+        """Joint of every input, or its name as a channel; columns behind these scale numbers of servos.
 
-    @abstractmethod
-    def late(
-        self, law: Callable[[Float[Array, " time"]], Float[Array, " time"]], u: Float[Array, " time"]
-    ) -> Float[Array, " time"]:
-        """An input by a law that takes time and begins at 0; that of equations begins as it is in the first row."""
-
-    @abstractmethod
-    def at_ports(self, torque: Float[Array, " dof"]) -> Float[Array, " port"]:
-        """Torques of the learned maps of the joints as pushes at all ports."""
+        Before the first row what drives a joint was 0, and what has a name stood as in it.
+        """
 
     @abstractmethod
     def slopes(

@@ -15,7 +15,7 @@ from nnap_em.diagnosis import refit as refits
 from nnap_em.em import loop, multistep, stated
 from nnap_em.em.loop import EMState, Schedule
 from nnap_em.em.mstep import MStepInfo, ScoringMStep
-from nnap_em.em.multistep import Followed, OpenLoop
+from nnap_em.em.multistep import Followed, Linear, OpenLoop
 from nnap_em.fit import identify
 from nnap_em.fit.identify import Identified
 from nnap_em.numerics.gaussian import Gaussian
@@ -270,8 +270,9 @@ def test_recordings_that_disagree_and_forces_unsaid_widen_a_posterior_but_not_it
     pushed = np.broadcast_to([1.0, 0.0, 2.0], (*errors.shape, 3))
     prediction = OpenLoop(errors, np.concatenate([columns, pushed], axis=-1), np.ones(2))
     every, likelihood = np.ones(4, bool), 50
-    given = {"discrepancy_columns": lambda *_, **__: None, "open_loop": lambda *_: prediction}
-    _fake(monkeypatch, stated, followed=lambda *_: None, size=lambda *_: force, **given)
+    _fake(monkeypatch, multistep, open_loop=lambda *_: prediction)
+    given = {"discrepancy_columns": lambda *_, **__: None, "followed": lambda *_: None}
+    _fake(monkeypatch, stated, size=lambda *_: force, **given)
     hessian = RULE.weights(MODEL).prior_precision(MODEL.unknown).at[-1, -1].add(likelihood)
     precision, size = stated.widened(MODEL, RULE, PATH, DATA, every, hessian, key=jax.random.key(0))
     assert size == force
@@ -300,7 +301,8 @@ def test_the_size_of_forces_unsaid_is_that_which_made_the_errors():
         for _ in range(8):
             own, other = rng.normal(size=(2000, 1)), rng.normal(size=(2000, 60)) / np.sqrt(np.arange(1, 61))
             error = own[:, 0] + tau * other @ rng.normal(size=60) + 0.5 * rng.normal(size=2000)
-            left = stated.Errors(error, own, other, np.full(2000, 4.0), 2000.0)
+            rows = error, np.concatenate([own, other], axis=1), np.full(2000, 4.0)
+            left = Linear(*(a[None, :, None, None] for a in rows), np.ones(1))
             sizes.append(stated.size(left, 1.0 + 4.0 * own.T @ own))
         if tau:
             assert np.mean(sizes) == pytest.approx(tau, rel=0.1)

@@ -16,7 +16,8 @@ from nnap_em.diagnosis.findings import changes
 from nnap_em.diagnosis.outcome import Diagnosis
 from nnap_em.diagnosis.verdict import KEEP, RISEN, veto
 from nnap_em.effects.position import TorsionalSpring
-from nnap_em.em.recorded import Risen, deleted, level, risen
+from nnap_em.em.multistep import Linear
+from nnap_em.em.recorded import Risen, level, risen
 from nnap_em.fit.identify import begin
 from nnap_em.fit.known import differences, known
 from nnap_em.fit.store import load, save
@@ -129,15 +130,15 @@ def test_where_nothing_explains_it_the_errors_decide():
 def test_errors_left_out_are_those_of_a_fit_without_the_recording():
     """A linear problem: one step is exact."""
     rng = np.random.default_rng(0)
-    columns, weight = rng.normal(size=(5, 30, 4)), rng.uniform(0.5, 2, (5, 30))
-    prior, y = np.diag([1.0, 2.0, 0.5, 0.1]), rng.normal(size=(5, 30))
+    columns, weight = rng.normal(size=(5, 30, 1, 1, 4)), rng.uniform(0.5, 2, (5, 30, 1, 1))
+    prior, y = np.diag([1.0, 2.0, 0.5, 0.1]), rng.normal(size=(5, 30, 1, 1))
 
     def solved(some):
         c, w, e = columns[some].reshape(-1, 4), weight[some].ravel(), y[some].ravel()
         return np.linalg.solve(prior + c.T @ (w[:, None] * c), c.T @ (w * e))
 
     error = y - columns @ solved(np.arange(5))
-    out = deleted(columns, weight, error, prior)
+    out = Linear(error, columns, weight, np.ones(1)).left_out(prior)
     for i in range(5):
         np.testing.assert_allclose(out[i], y[i] - columns[i] @ solved(np.arange(5) != i), rtol=1e-9)
 

@@ -281,15 +281,15 @@ def test_a_simulation_that_runs_away_makes_no_step_singular():
     error, columns = np.full((1, 1, 40, 1), 0.1), np.ones((1, 1, 40, 1, 2))
     of = simulated.Simulated(None, None, np.zeros(2), np.zeros((1, 1, 2)), error, columns, 1e12 * columns)  # type: ignore[arg-type]
     scale, counts = np.ones((1, 1, 1, 1)), np.ones(error.shape, bool)
-    for step in simulated._normal(of, scale, counts).solved(0.0):
+    for step in simulated._step(of, scale, counts, 0.0):
         assert np.isfinite(step).all()
     far = np.array(error)
     far[0, 0, 20:] = 31.0
-    half = of._replace(error=error[:, :, :20], columns=columns[:, :, :20], by_start=columns[:, :, :20])
-    away = of._replace(error=far, by_start=columns, columns=np.where(far[..., None] > 1, 1e150, columns))
-    first = simulated._normal(half, scale, counts[:, :, :20])
+    half = of._replace(error=error[:, :, :20], columns=columns[:, :, :20], by_start=0 * columns[:, :, :20])
+    away = of._replace(error=far, by_start=0 * columns, columns=np.where(far[..., None] > 1, 1e150, columns))
+    first = simulated._eliminated(half, scale, counts[:, :, :20])[0]
     variances = 0.1**2, (0.1**2 + simulated.HUBER * (2 * simulated.FARTHEST - simulated.HUBER)) / 2
-    ratio = simulated._normal(away, scale, counts).score / first.score
+    ratio = simulated._eliminated(away, scale, counts)[0][:, 0] / first[:, 0]
     np.testing.assert_allclose(ratio, variances[0] / variances[1], rtol=1e-9)
 
 

@@ -15,7 +15,7 @@ from nnap_em.diagnosis import refit as refits
 from nnap_em.em import loop, multistep, stated
 from nnap_em.em.loop import EMState, Schedule
 from nnap_em.em.mstep import MStepInfo, ScoringMStep
-from nnap_em.em.multistep import Followed, OpenLoop
+from nnap_em.em.multistep import Followed, Linear, OpenLoop
 from nnap_em.fit import identify
 from nnap_em.fit.identify import Identified
 from nnap_em.numerics.gaussian import Gaussian
@@ -160,25 +160,6 @@ def test_em_rests_where_nothing_moves():
         assert not loop._ended(_state([0.0], **changes), Schedule(first=4, hold=1), 9, 0.05)  # not yet the whole
 
 
-WHOLE = [0.0, 90.0, 6.0, 6.0]
-RISES = [
-    ([*WHOLE, 6.04, 6.08], {}, 0.0),
-    ([*WHOLE, 6.04, 6.11], {}, 0.11),
-    ([*WHOLE, 6.5, 6.2], {}, 0.5),  # the last step was tried, and refused
-    ([*WHOLE, 5.0, 6.9], {"ess": 100.0}, 0.0),  # by chance, of a sample
-    ([*WHOLE, 5.0, loop.DIVERGED, 7.1], {"ess": 100.0}, 1.1),  # a refused step says nothing of chance
-    (WHOLE, {}, np.inf),
-    ([*WHOLE[1:], 6.0], {"epoch": 5}, 0.0),  # begun from another fit, whose first epoch counts
-]
-
-
-def test_a_fit_that_its_epochs_end_has_the_rise_of_its_likelihood():
-    """Two epochs see 4 of 9 samples; what they reached is no measure of the others, and two others are too few."""
-    for loglik, changes, rise in RISES:
-        state = _state([0.0], **{"epoch": len(loglik), "ess": np.inf, "loglik": np.array(loglik), **changes})
-        assert loop.unsettled(state, Schedule(first=4, growth=3.0, hold=1), 9) == pytest.approx(rise)
-
-
 def test_the_likeliest_process_noise_is_where_it_begins(monkeypatch):
     tried = []
 
@@ -267,8 +248,9 @@ def test_recordings_that_disagree_and_forces_unsaid_widen_a_posterior_but_not_it
     pushed = np.broadcast_to([1.0, 0.0, 2.0], (*errors.shape, 3))
     prediction = OpenLoop(errors, np.concatenate([columns, pushed], axis=-1), np.ones(2))
     every, likelihood = np.ones(4, bool), 50
-    given = {"discrepancy_columns": lambda *_, **__: None, "open_loop": lambda *_: prediction}
-    _fake(monkeypatch, stated, followed=lambda *_: None, size=lambda *_: force, **given)
+    _fake(monkeypatch, multistep, open_loop=lambda *_: prediction)
+    given = {"discrepancy_columns": lambda *_, **__: None, "followed": lambda *_: None}
+    _fake(monkeypatch, stated, size=lambda *_: force, **given)
     hessian = RULE.weights(MODEL).prior_precision(MODEL.unknown).at[-1, -1].add(likelihood)
     precision, size = stated.widened(MODEL, RULE, PATH, DATA, every, hessian, key=jax.random.key(0))
     assert size == force
@@ -297,7 +279,8 @@ def test_the_size_of_forces_unsaid_is_that_which_made_the_errors():
         for _ in range(8):
             own, other = rng.normal(size=(2000, 1)), rng.normal(size=(2000, 60)) / np.sqrt(np.arange(1, 61))
             error = own[:, 0] + tau * other @ rng.normal(size=60) + 0.5 * rng.normal(size=2000)
-            left = stated.Errors(error, own, other, np.full(2000, 4.0), 2000.0)
+            rows = error, np.concatenate([own, other], axis=1), np.full(2000, 4.0)
+            left = Linear(*(a[None, :, None, None] for a in rows), np.ones(1))
             sizes.append(stated.size(left, 1.0 + 4.0 * own.T @ own))
         if tau:
             assert np.mean(sizes) == pytest.approx(tau, rel=0.1)

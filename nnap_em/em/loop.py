@@ -235,29 +235,13 @@ def fit(
     return state._replace(stop=SPENT)
 
 
-def _afresh(state: EMState) -> EMState:
-    """The state restarted from the best model, without likelihoods to compare with."""
-    return state._replace(model=state.best, top=np.full(state.top.size, -np.inf), stride=1.0, since=state.epoch)
-
-
 def _released(state: EMState) -> EMState:
-    """The next stage of the M-step, with a model that is integrated as finely as friction has become steep."""
-    best = state.best.resolved()
-    return _afresh(state._replace(best=best, proposal=best, stage=state.stage + 1))
-
-
-def unsettled(state: EMState, schedule: Schedule, longest: int) -> float:
-    """Rise of the log-likelihood in the last two epochs of a fit [nat a sequence]; 0 for one that is at rest, infinite
-    where fewer than three epochs saw whole sequences. A sampled likelihood rises by more than it ever fell.
+    """The next stage of the M-step, from the best model, integrated as finely as friction has become steep; there are
+    no likelihoods to compare with.
     """
-    epochs = range(state.epoch - len(state.loglik), state.epoch)  # a fit begun from another starts at 1
-    every = [(schedule.horizon(epoch, longest), v) for epoch, v in zip(epochs, state.loglik, strict=True)]
-    whole = [v for seen, v in every if seen == longest and v > DIVERGED]  # a refused step is none
-    if len(whole) < 3:
-        return math.inf
-    least = 2 * REST if math.isinf(state.ess) else max(2 * REST, float(np.max(-np.diff(whole))))
-    rise = float(max(whole[-2:]) - max(whole[:-2]))
-    return rise if rise >= least else 0.0
+    best, unknown = state.best.resolved(), np.full(state.top.size, -np.inf)
+    state = state._replace(model=best, best=best, proposal=best, top=unknown, stride=1.0)
+    return state._replace(stage=state.stage + 1, since=state.epoch)
 
 
 def _rise(state: EMState, path: Gaussian, data: Dataset, rule, used: Bool[np.ndarray, " seq"]) -> float:

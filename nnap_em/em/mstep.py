@@ -21,7 +21,7 @@ from ..data.dataset import Dataset
 from ..model.base import AbstractModel
 from ..model.state_space import StateSpaceModel
 from ..numerics.gaussian import Gaussian
-from ..numerics.parallel import each, few_sizes, on_default_device
+from ..numerics.parallel import each, on_default_device
 from ..smoother.kalman import Cubature, Tangent, kalman_filter
 from ..smoother.posterior import Posterior
 from .prior import ParameterPrior
@@ -117,12 +117,6 @@ def _widened(prior: ParameterPrior, w, linear: Local, path: Gaussian, pad: int):
     return wide, jnp.asarray(widen(w)), moved, jax.tree.map(lambda a: np.asarray(a)[:, 0], path)
 
 
-def _lengthened(every: Any) -> Any:
-    """Arrays of all sequences, zero for more of them: one program for many numbers of sequences."""
-    size = few_sizes(len(jax.tree.leaves(every)[0]))
-    return jax.tree.map(lambda a: np.pad(np.asarray(a), [(0, size - len(a))] + [(0, 0)] * (a.ndim - 1)), every)
-
-
 @eqx.filter_jit
 def _noise_floor(linear: Local, log_q: Float[Array, " state"], log_r: Float[Array, " obs"]) -> Float[Array, " obs"]:
     """`log_r` where it is no less than the mean effect of the kicks of a step, as accelerations, on a reading."""
@@ -135,13 +129,6 @@ def _noise_floor(linear: Local, log_q: Float[Array, " state"], log_r: Float[Arra
     count = jnp.sum(known, axis=(0, 1), dtype=square.dtype)
     mean = jnp.sum(jnp.where(known, square, 0.0), axis=(0, 1)) / jnp.maximum(count, 1.0)
     return jnp.maximum(log_r, jnp.log(mean))
-
-
-@eqx.filter_jit
-def _narrowed(core: Core, hessian, pad: int):
-    """The prior without the last `pad` parameters."""
-    size = hessian.shape[0] - pad
-    return core._replace(w=core.w[: core.w.shape[0] - pad]), hessian[:size, :size]
 
 
 @eqx.filter_jit
@@ -261,12 +248,12 @@ class ScoringMStep(AbstractMStep):
         linear = linear._replace(by_parameter=of_state, reading_by_parameter=of_reading)  # pyrefly: ignore[bad-argument-type]
         common = (core.log_q, core.log_r, core.start, rule.weights(core).nodes)
         terms = each(_quadratic, common, (linear, posterior, read))
-        every = _lengthened((terms, first, posterior.loglik, used))
+        every = terms, first, posterior.loglik, used
         core, hessian, took_part = _advance(*on_default_device((rule, core._replace(w=w), *every)))
-        used = np.asarray(took_part)[: len(used)]
         if linear.reading_by_force is not None:
             core = core._replace(log_r=_noise_floor(linear, core.log_q, core.log_r))
-        return *_narrowed(core, hessian, pad), used
+        size = hessian.shape[0] - pad
+        return core._replace(w=core.w[: core.w.shape[0] - pad]), hessian[:size, :size], np.asarray(took_part)
 
     def noise(self, model: Core, total: Quadratic, dof: int) -> tuple[Float[Array, " state"], Float[Array, " obs"]]:
         """Log variances of process and reading noise after the step."""

@@ -289,12 +289,6 @@ def ratio(before, after, used: Bool[np.ndarray, " seq"]) -> float:
     return float(np.mean(second[first > 0] / first[first > 0])) if (first > 0).any() else 1.0
 
 
-def cleaned(predictions: OpenLoop, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Columns and errors, 0 where the weight is."""
-    columns = np.where(weight[..., None] > 0, predictions.columns, 0.0).astype(float)
-    return columns, np.where(weight > 0, predictions.error, 0.0)
-
-
 def weighed(predictions: OpenLoop, used: Bool[np.ndarray, " seq"]) -> Float[np.ndarray, "seq start horizon obs"]:
     """Robust weights: one over the variance of a sequence, horizon and channel, less for outliers, 0 for none."""
     error = np.where(used[:, None, None, None], predictions.error, np.nan)
@@ -303,6 +297,47 @@ def weighed(predictions: OpenLoop, used: Bool[np.ndarray, " seq"]) -> Float[np.n
         size = np.minimum(1.0, HUBER_STD * scale / np.abs(error))
     sound = np.isfinite(error) & np.isfinite(predictions.columns).all(axis=-1)
     return np.where(sound, size / scale**2 / predictions.overlap[:, None], 0.0)
+
+
+class Linear(NamedTuple):
+    """Errors, e - J d after a change d of what is estimated, and their weights; all 0 where one does not count."""
+
+    error: Float[np.ndarray, "seq start horizon obs"]
+    columns: Float[np.ndarray, "seq start horizon obs column"]
+    weight: Float[np.ndarray, "seq start horizon obs"]
+    overlap: Float[np.ndarray, " horizon"]
+    """Number of errors that count as one."""
+
+    def scores(self) -> Float[np.ndarray, "seq start column"]:
+        """J' W e of every start."""
+        return np.einsum("skhoc,skho->skc", self.columns, self.weight * self.error)
+
+    def information(self, some: int | slice = slice(None)) -> Float[np.ndarray, "column column"]:
+        """J' W J of all sequences, or of some."""
+        columns = self.columns[some].reshape(-1, self.columns.shape[-1])
+        return (columns * self.weight[some].reshape(-1, 1)).T @ columns
+
+    def left_out(self, prior: Float[np.ndarray, "column column"]) -> Float[np.ndarray, "seq start horizon obs"]:
+        """Errors of every sequence after the change that fits the others best, by Cook's formula for deletion.
+
+        e_s + J_s (A - J_s' W J_s)^-1 J_s' W e_s,   A = prior + sum J' W J     [Cook 1977, Technometrics 19(1)]
+        """
+        whole, scores = prior + self.information(), self.scores().sum(axis=1)
+        away = [np.linalg.solve(whole - self.information(s), score) for s, score in enumerate(scores)]
+        return self.error + np.einsum("skhoc,sc->skho", self.columns, np.stack(away))
+
+
+def linear(
+    along: Followed,
+    weights: Weights,
+    used: Bool[np.ndarray, " seq"],
+    extra: Callable[[Int[np.ndarray, " sequence"]], Columns] | None = None,
+) -> Linear:
+    """Errors of the sequences `used` at `HORIZONS` with their robust weights."""
+    predictions = open_loop(along, weights, extra)
+    keep = (weight := weighed(predictions, used)) > 0
+    columns = np.where(keep[..., None], predictions.columns, 0.0).astype(float)
+    return Linear(np.where(keep, predictions.error, 0.0), columns, weight, predictions.overlap)
 
 
 LEAST_FALL = 0.01
@@ -326,17 +361,14 @@ def finish(
     error = errors(best, JUDGED)
     for _ in range(3):
         model, weights = best.model, m_step.weights(best.model)
-        predictions = open_loop(best, weights)
-        weight = weighed(predictions, used)
-        keep = weight > 0
-        jac, e, w = predictions.columns[keep].astype(float), predictions.error[keep], weight[keep]
-        score, information = jnp.asarray(jac.T @ (w * e)), jnp.asarray((jac * w[:, None]).T @ jac)
+        one = linear(best, weights, used)
+        score, information = one.scores().sum(axis=(0, 1)), one.information()
         start, nodes = weights.read(model), slice(weights.nodes.size)
         if shaped and weights.known is None:
             precision, pull = friction_prior(model, weights)  # parameters have theirs in the fit
-            information = information.at[nodes, nodes].add(precision[nodes, nodes])
-            score = score.at[nodes].add(-pull[nodes])
-        goal = _goal(weights, model.unknown, start, score, information)
+            information[nodes, nodes] += precision[nodes, nodes]
+            score[nodes] -= pull[nodes]
+        goal = _goal(weights, model.unknown, start, jnp.asarray(score), jnp.asarray(information))
         for share in (1.0, 0.5, 0.25):
             trial = followed(weights.write(model, start + share * (goal - start)), m_step.prior, path, data)
             trial_error = errors(trial, JUDGED)

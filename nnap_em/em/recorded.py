@@ -11,39 +11,17 @@ from ..data.dataset import Dataset
 from ..model.state_space import StateSpaceModel
 from ..numerics.gaussian import Gaussian
 from .mstep import ScoringMStep
-from .multistep import cleaned, followed, huber, open_loop, weighed
+from .multistep import followed, huber, linear
 
 
 def left_out(
     model: StateSpaceModel, m_step: ScoringMStep, path: Gaussian, data: Dataset, used: Bool[np.ndarray, " seq"]
 ) -> Float[np.ndarray, "seq start horizon obs"]:
-    """Errors of every recording with the friction and the numbers that the others give, by one Gauss-Newton step.
-
-    e_s + J_s (A - J_s' W J_s)^-1 J_s' W e_s,   A = prior + sum J' W J     [Cook 1977, Technometrics 19(1)]
-    """
+    """Errors of every recording with the friction and the numbers that the others give, by one Gauss-Newton step."""
     weights = m_step.weights(model)
-    along = open_loop(followed(model, m_step.prior, path, data), weights)
-    weight = weighed(along, used)
-    columns, error = cleaned(along, weight)
+    one = linear(followed(model, m_step.prior, path, data), weights, used)
     prior = np.asarray(weights.prior_precision(model.unknown))
-    rows = len(error), -1
-    moved = deleted(columns.reshape(*rows, columns.shape[-1]), weight.reshape(rows), error.reshape(rows), prior)
-    out = moved.reshape(error.shape)
-    return np.where(used[:, None, None, None] & (weight > 0), out, np.nan)
-
-
-def deleted(
-    columns: Float[np.ndarray, "seq row phi"],
-    weight: Float[np.ndarray, "seq row"],
-    error: Float[np.ndarray, "seq row"],
-    prior: Float[np.ndarray, "phi phi"],
-) -> Float[np.ndarray, "seq row"]:
-    """Errors of each sequence with the numbers that fit the others best, where errors are linear in them."""
-    information = np.einsum("srp,sr,srq->spq", columns, weight, columns)
-    score = np.einsum("srp,sr->sp", columns, weight * error)
-    whole = prior + information.sum(axis=0)
-    away = np.stack([np.linalg.solve(whole - i, g) for i, g in zip(information, score, strict=True)])
-    return error + np.einsum("srp,sp->sr", columns, away)
+    return np.where(one.weight > 0, one.left_out(prior), np.nan)
 
 
 def level(

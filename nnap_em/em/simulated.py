@@ -190,31 +190,6 @@ def log_posterior(of: Simulated, scale: Scale, counts: Counts) -> float:
     return -0.5 * number * math.log(cost(of.error, scale, counts) / number + 1e-12) - 0.5 * prior
 
 
-class _Normal(NamedTuple):
-    """Normal equations of parameters and starts, with their prior."""
-
-    score: Float[np.ndarray, " param"]
-    information: Float[np.ndarray, "param param"]
-    start_score: Float[np.ndarray, "window state"]
-    start_information: Float[np.ndarray, "window state state"]
-    both: Float[np.ndarray, "window state param"]
-
-    def solved(self, damping: float) -> tuple[np.ndarray, np.ndarray]:
-        """Damped steps of parameters and starts."""
-        joint = np.concatenate([self.start_score[..., None], self.both], axis=-1)
-        inner = _solve(self.start_information, joint, damping)
-        information = self.information * (1 + damping * np.eye(len(self.score)))
-        reduced = information - np.einsum("wsp,wsq->pq", self.both, inner[..., 1:])
-        step = _solve(reduced, (self.score - np.einsum("wsp,ws->p", self.both, inner[..., 0]))[:, None])[:, 0]
-        return step, inner[..., 0] - inner[..., 1:] @ step
-
-    @property
-    def reduced(self) -> Float[np.ndarray, "param param"]:
-        """Precision of the parameters, all starts integrated out."""
-        inner = _solve(self.start_information, self.both)
-        return self.information - np.einsum("wsp,wsq->pq", self.both, inner)
-
-
 def _solve(a: Float[np.ndarray, "*n s s"], b: Float[np.ndarray, "*n s k"], damping: float = 0.0) -> np.ndarray:
     """Solution of a x = b of positive definite matrices, in units of their diagonals: rounding makes none singular."""
     unit = 1 / np.sqrt(np.maximum(np.einsum("...ii->...i", a), 1e-300))
@@ -222,25 +197,33 @@ def _solve(a: Float[np.ndarray, "*n s s"], b: Float[np.ndarray, "*n s k"], dampi
     return unit[..., None] * np.linalg.solve(scaled, unit[..., None] * b)
 
 
-def _normal(of: Simulated, scale: Scale, counts: Counts, worth: float = 1.0) -> _Normal:
-    """Normal equations by the errors that count, each `worth` so many independent ones."""
-    keep = counts & np.isfinite(of.columns).all(axis=-1) & np.isfinite(of.by_start).all(axis=-1)
+def _eliminated(of: Simulated, scale: Scale, counts: Counts, *, damping: float = 0.0, worth: float = 1.0):
+    """Damped normal equations of the parameters, the score and then their precision, with the starts of all windows
+    eliminated; and these, with no parameter moved and by each. Errors that count are `worth` so many independent ones.
+    """
+    columns, size = np.concatenate([of.columns, of.by_start], axis=-1), len(of.z)
+    keep = counts & np.isfinite(columns).all(axis=-1)
     keep = keep & (np.abs(of.error) < FARTHEST * scale)  # no NaN is; what runs away costs the same wherever it is
     variance = max(cost(of.error, scale, counts) / max(float(np.sum(counts)), 1.0), 1e-12)
     with np.errstate(invalid="ignore", divide="ignore"):
         weight = worth * np.minimum(1.0, HUBER * scale / np.abs(of.error)) / (variance * scale**2)
-    flat = lambda a: a.reshape(a.shape[0] * a.shape[1], a.shape[2] * a.shape[3], *a.shape[4:])  # noqa: E731  a row for a window
-    clean = lambda a, mask: np.where(mask, a, 0.0)  # noqa: E731
-    weight, error = flat(clean(weight, keep)), flat(clean(of.error, keep))
-    columns, by_start = flat(clean(of.columns, keep[..., None])), flat(clean(of.by_start, keep[..., None]))
-    weighted, start = weight[..., None] * columns, of.start.reshape(len(error), -1)
-    return _Normal(
-        np.einsum("wep,we->p", weighted, error) - of.z,
-        np.einsum("wep,weq->pq", weighted, columns) + np.eye(len(of.z)),
-        np.einsum("wes,we->ws", by_start, weight * error) - start,
-        np.einsum("wes,wet->wst", weight[..., None] * by_start, by_start) + np.eye(start.shape[1]),
-        np.einsum("wes,wep->wsp", by_start, weighted),
-    )
+    every = np.concatenate([of.error[..., None], columns], axis=-1)
+    every, weight = np.where(keep[..., None], every, 0.0), np.where(keep, weight, 0.0)
+    every, weight = (a.reshape(-1, a.shape[2] * a.shape[3], *a.shape[4:]) for a in (every, weight[..., None]))
+    sums = np.swapaxes(every[..., 1:] * weight, 1, 2) @ every  # of every window, the score first
+    own, by_start = sums[:, :size, : size + 1].sum(axis=0), sums[:, size:, : size + 1]
+    own += np.concatenate([-of.z[:, None], np.eye(size)], axis=1)
+    own[:, 1:] *= 1 + damping * np.eye(size)
+    rest = by_start - np.pad(of.start.reshape(*by_start.shape[:2], 1), ((0, 0), (0, 0), (0, size)))
+    starts = _solve(sums[:, size:, size + 1 :] + np.eye(by_start.shape[1]), rest, damping)
+    return own - np.einsum("wsp,wsq->pq", by_start[..., 1:], starts), starts
+
+
+def _step(of: Simulated, scale: Scale, counts: Counts, damping: float) -> tuple[np.ndarray, np.ndarray]:
+    """Damped Gauss-Newton step of parameters and starts."""
+    normal, starts = _eliminated(of, scale, counts, damping=damping)
+    step = _solve(normal[:, 1:], normal[:, :1])[:, 0]
+    return step, starts[..., 0] - starts[..., 1:] @ step
 
 
 def fit(
@@ -281,7 +264,7 @@ def fit_all(
         in_time()
         ahead, moved = [], []
         for i in open_:
-            step, start = _normal(best[i], scale, known).solved(damping[i])
+            step, start = _step(best[i], scale, known, damping[i])
             ahead.append(best[i].prior.write(best[i].model, jnp.asarray(best[i].z + step)))
             moved.append(best[i].start + start.reshape(best[i].start.shape))
         trials = together(ahead, [priors[i] for i in open_], moved, data, begin) if open_ else []
@@ -300,4 +283,5 @@ def fit_all(
 def precision(of: Simulated) -> Float[np.ndarray, "param param"]:
     """Posterior precision of the parameters, by as many errors as are independent."""
     known = of.observed
-    return _normal(of, scale_of(of), known, independent(of) / max(float(known.sum()), 1.0)).reduced
+    worth = independent(of) / max(float(known.sum()), 1.0)
+    return _eliminated(of, scale_of(of), known, worth=worth)[0][:, 1:]

@@ -5,7 +5,6 @@ that no part of the model describes, which stand in every recording alike and be
 """
 
 import math
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,23 +17,9 @@ from ..numerics.gaussian import Gaussian
 from ..numerics.parallel import each
 from ..smoother.kalman import kalman_filter, rts
 from .mstep import ScoringMStep
-from .multistep import Columns, OpenLoop, cleaned, followed, open_loop, sensitivities, weighed
+from .multistep import Columns, Linear, followed, linear, sensitivities
 from .quadratic import locals_along
 from .weights import Weights
-
-
-class Errors(NamedTuple):
-    """Multi-step errors in a row, what each source moves in them, and their weights."""
-
-    error: Float[np.ndarray, " row"]
-    own: Float[np.ndarray, "row phi"]
-    """Columns of the estimated quantities."""
-    other: Float[np.ndarray, "row force"]
-    """Columns of forces that no part of the model describes."""
-    weight: Float[np.ndarray, " row"]
-    """One over the variance, less where errors overlap."""
-    rows: float
-    """Number of rows, did they not overlap."""
 
 
 def widened(
@@ -60,16 +45,15 @@ def widened(
     weights = m_step.weights(model)
     other = discrepancy_columns(model, weights, path, data, used, key=key)
     along = followed(model, m_step.prior, path, data)
-    predictions = open_loop(along, weights, lambda indices: jax.tree.map(lambda a: a[indices], other))
+    one = linear(along, weights, used, lambda indices: jax.tree.map(lambda a: a[indices], other))
     prior = np.asarray(weights.prior_precision(model.unknown))
-    errors, scores = _rows(predictions, weighed(predictions, used), len(prior))
-    information = prior + errors.own.T @ (errors.weight[:, None] * errors.own)
-    scores = clustered(scores[used], predictions.overlap)
+    own, shared = np.split(one.information()[: len(prior)], [len(prior)], axis=1)
+    information = prior + own
+    scores = clustered(one.scores()[used, :, : len(prior)], one.overlap)
     scores = scores - scores.mean(axis=0)
     count = len(scores)
-    force = size(errors, information)
-    shared = force * errors.own.T @ (errors.weight[:, None] * errors.other)
-    sources = np.concatenate([math.sqrt(count / max(count - 1, 1)) * scores.T, shared], axis=1)
+    force = size(one, information)
+    sources = np.concatenate([math.sqrt(count / max(count - 1, 1)) * scores.T, force * shared], axis=1)
     strength, turn = np.linalg.eigh(np.asarray(hessian) - prior)
     half = turn * np.sqrt(np.maximum(strength, 0.0))  # L = half half'
     across = half.T @ np.linalg.solve(information, sources)
@@ -128,23 +112,25 @@ def discrepancy_columns(
     return Columns(force, np.zeros((*force.shape[:3], data.y.shape[-1]), force.dtype))
 
 
-def size(errors: Errors, information: Float[np.ndarray, "column column"]) -> float:
-    """Standard deviation tau of the strengths of `other`, at its largest likelihood.
+def size(one: Linear, information: Float[np.ndarray, "phi phi"]) -> float:
+    """Standard deviation tau of the strengths of the columns behind those of phi, at its largest likelihood.
 
     error = estimated x + tau other z + noise, with z standard normal, the size of the noise free, x projected out as
     far as the prior lets it; zero where no such force explains errors.
     """
-    root = np.sqrt(errors.weight)[:, None]
-    estimated, other, error = root * errors.own, root * errors.other, root[:, 0] * errors.error
+    root = np.sqrt(one.weight)
+    columns, error = (root[..., None] * one.columns).reshape(root.size, -1), (root * one.error).ravel()
+    estimated, other = np.split(columns, [len(information)], axis=1)
     other, error = (a - estimated @ np.linalg.solve(information, estimated.T @ a) for a in (other, error))
     strength, turn = np.linalg.eigh(other.T @ other)
     strength, along, whole = np.maximum(strength, 0.0), (turn.T @ (other.T @ error)) ** 2, float(error @ error)
     if whole == 0.0 or not strength.any():
         return 0.0
+    rows = float(np.sum((root > 0) / one.overlap[:, None]))  # did they not overlap
     # variance of what such forces add over that of the rest, where it is known best
     ratios = np.concatenate([[0.0], np.geomspace(1e-3, 1e5, 49)])[:, None] / strength[-1]
-    noise = np.maximum(whole - np.sum(along * ratios / (1 + ratios * strength), axis=1), 1e-12 * whole) / errors.rows
-    best = np.argmin(0.5 * errors.rows * np.log(noise) + 0.5 * np.sum(np.log1p(ratios * strength), axis=1))
+    noise = np.maximum(whole - np.sum(along * ratios / (1 + ratios * strength), axis=1), 1e-12 * whole) / rows
+    best = np.argmin(0.5 * rows * np.log(noise) + 0.5 * np.sum(np.log1p(ratios * strength), axis=1))
     return math.sqrt(float(ratios[best, 0] * noise[best]))
 
 
@@ -155,14 +141,3 @@ def clustered(
     if len(scores) > 1:
         return scores.sum(axis=1)
     return np.add.reduceat(scores[0], np.arange(0, scores.shape[1], max(1, round(4 * float(overlap[-1])))))
-
-
-def _rows(
-    predictions: OpenLoop, weight: Float[np.ndarray, "seq start horizon obs"], phi: int
-) -> tuple[Errors, Float[np.ndarray, "seq start phi"]]:
-    """The errors in a row, and the score of every start."""
-    columns, error = cleaned(predictions, weight)
-    scores = np.einsum("skhoc,skho->skc", columns[..., :phi], weight * error)
-    flat = columns.reshape(-1, columns.shape[-1])
-    count = float(np.sum((weight > 0) / predictions.overlap[:, None]))
-    return Errors(error.ravel(), flat[:, :phi], flat[:, phi:], weight.ravel(), count), scores

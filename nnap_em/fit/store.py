@@ -148,6 +148,7 @@ def _assemble(path: Path, header: Mapping[str, Any], arrays: Mapping[str, np.nda
     if wide and jnp.zeros(()).dtype != np.float64:
         refuse(path, "its numbers have 64 bits", 'first call jax.config.update("jax_enable_x64", True)')
     leaves: dict[str, dict[str, Any]] = dict(header["leaves"])
+    leaves.pop("/rise", None)  # `state.stop` says it
 
     def differs(place: str, problem: str) -> NoReturn:
         problem = f"another structure at {place.strip('/')}: {problem} (it was written by nnap_em {header['version']}"

@@ -22,7 +22,7 @@ def cache(tmp_path, monkeypatch) -> Path:
     """A cache in use, in a process that has no program yet."""
     monkeypatch.setattr(traced._Programs, "folder", tmp_path / "cache")
     monkeypatch.setattr(traced._Programs, "ready", {})
-    for function in (_linearised, _called_back, _wrong, _named):  # as if it were the package's
+    for function in (_linearised, _called_back, _wrong):  # as if it were the package's
         monkeypatch.setattr(function, "__module__", "nnap_em.somewhere")
     return tmp_path / "cache"
 
@@ -125,17 +125,12 @@ def _wrong(common, one):
     raise ZeroDivisionError("told by the function")
 
 
-def _named(common, one):
-    return {"doubled": common * one}
-
-
 def test_what_a_key_cannot_tell_or_a_file_cannot_hold_runs_all_the_same(cache, work, monkeypatch):
     """A function of another package may say something else tomorrow; so may a closure."""
     numbers = jnp.arange(3.0)
     for factor in (2.0, 3.0):
         np.testing.assert_array_equal(parallel.each(_own, jnp.asarray(factor), numbers), factor * np.arange(3.0))
     np.testing.assert_array_equal(parallel.each(_called_back, None, numbers), [0.0, 2.0, 4.0])
-    np.testing.assert_array_equal(parallel.each(_named, jnp.asarray(2.0), numbers)["doubled"], [0.0, 2.0, 4.0])
     with pytest.raises(ZeroDivisionError, match="told by the function"):
         parallel.each(_wrong, None, numbers)
     slope = 2.0

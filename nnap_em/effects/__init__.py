@@ -4,7 +4,7 @@ import importlib
 import pkgutil
 
 from .base import AbstractEffect, Candidate, JointEffect, OperatingPoint, SearchScales, SensorEffect, fields, flat
-from .function import Axis, InputAxis, free_form
+from .function import free_form
 
 
 def _leaves(kind: type[AbstractEffect]) -> list[type[AbstractEffect]]:
@@ -16,10 +16,8 @@ for _module in sorted(m.name for m in pkgutil.iter_modules(__path__)):
 
 catalogue: dict[str, type[AbstractEffect]] = {kind.name: kind for kind in _leaves(AbstractEffect)}
 """Effects by their names."""
-parts: tuple[type, ...] = (Axis, InputAxis)
-"""Parts of effects besides numbers."""
 
 __all__ = [
     "AbstractEffect", "Candidate", "JointEffect", "OperatingPoint", "SearchScales", "SensorEffect", "catalogue",
-    "fields", "flat", "free_form", "parts",
+    "fields", "flat", "free_form",
 ]  # fmt: skip

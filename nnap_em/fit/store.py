@@ -1,40 +1,40 @@
 """A fitted model as one file: loading gives the same numbers to the last bit.
 
-The file is an npz: one member per array, named by its place in the tree, and a JSON header that holds the rig and
-the plain values.  No code is stored; loading builds the model anew from the rig and puts the numbers in.
+The file is an npz: one member per array, named by its place in the tree, and a JSON header that holds the kinds of all
+nodes by name, and the plain values. No code is stored, and none of a kind is run on loading.
 """
 
-import dataclasses
 import hashlib
+import inspect
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple, NoReturn
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .. import __version__
+from .. import __version__, smoothers  # noqa: F401
 from ..data.dataset import Dataset
-from ..data.limits import Bounds
-from ..data.rig import Declared, Rig
-from ..effects import catalogue, parts
-from ..numerics.digest import plain
-from ..smoother import kinds
+from ..numerics.digest import form_of, tree_of
 from ..storage.files import Kind, read_arrays, refuse, write_arrays
-from ..storage.leaves import describe, name_of, restore, tuples, walk
+from ..storage.leaves import describe, restore
 from ..systems import systems
-from .identify import Identified, begin
+from .identify import Identified
 
 MODEL_KIND = Kind(
-    "nnap_em fitted model", 4, "model",
+    "nnap_em fitted model", 5, "model",
     give="give the model.npz that `nnap-em identify` wrote",
     again="identify again, or use the version that wrote it",
 )  # fmt: skip
 
 MODEL_FILE, AFTER_FILE = "model.npz", "after.npz"
 """Files of an identification and of a diagnosis."""
+
+_IDENTITY = inspect.signature(eqx.nn.MLP.__init__).parameters["final_activation"].default
+_CODE = {code.__name__: code for code in (jax.nn.tanh, jnp.zeros_like, _IDENTITY)}
+"""Functions that a fit may hold, those of its friction, by name."""
 
 
 class Stored(NamedTuple):
@@ -72,35 +72,26 @@ def save(
         notes: whatever else should be kept, as JSON.
 
     Raises:
-        StoreError: it could not be loaded again, since it is of another structure than `identify` makes.
+        StoreError: it could not be loaded again.
 
     Example:
         >>> nnap_em.save(f"{folder}/model.npz", fit)
     """
     path = Path(path)
     arrays: dict[str, np.ndarray] = {}
-    leaves: dict[str, dict[str, Any]] = {}
 
     def leaf(place: str, value: Any) -> Any:
-        try:
-            leaves[place], array = describe(value)
-        except TypeError as error:
-            refuse(path, f"{place} is a {error}", "arrays, numbers and named functions can be stored")
+        entry, array = describe(value)
         if array is not None:
             arrays[place] = array
-        return value
+        return entry
 
-    walk(_tree(fitted), leaf)
-    header = {
-        "rig": dataclasses.asdict(fitted.rig),
-        "effects": [_sketch(path, effect) for effect in fitted.model.effects],
-        "smoother": _sketch(path, fitted.smoother),
-        "leaves": leaves,
-        "fingerprint": fingerprint,
-        "notes": dict(notes or {}),
-    }
-    _assemble(path, {"version": __version__, **header}, arrays)
-    write_arrays(path, MODEL_KIND, header, arrays)
+    try:
+        form = form_of(fitted, leaf)
+        _fit(form, arrays)
+    except (KeyError, TypeError) as error:
+        refuse(path, f"the fit holds what no file can ({error})", "arrays, numbers and loaded modules can be stored")
+    write_arrays(path, MODEL_KIND, {"fit": form, "fingerprint": fingerprint, "notes": dict(notes or {})}, arrays)
 
 
 def load(path: Path | str) -> Identified:
@@ -129,96 +120,23 @@ def read(path: Path) -> Stored:
     Raises StoreError if the file is damaged, foreign, or of another version.
     """
     header, arrays = read_arrays(path, MODEL_KIND)
-    try:
-        return Stored(_assemble(path, header, arrays), header["fingerprint"], header["notes"])
-    except (KeyError, TypeError, AttributeError) as error:
-        refuse(path, f"its header lacks something ({error!r})", "identify again with this version")
-
-
-def _tree(fitted: Identified) -> dict[str, Any]:
-    return {name: value for name, value in fitted._asdict().items() if name != "rig"}
-
-
-def _assemble(path: Path, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> Identified:
-    """The model that `header` and `arrays` describe, on the skeleton that its rig gives."""
-    rig = _rig(header["rig"])
-    if rig.system not in systems:
-        refuse(path, f"its system {rig.system!r} is not registered here", f"registered are {', '.join(systems)}")
     wide = any(array.dtype == np.float64 for array in arrays.values())
     if wide and jnp.zeros(()).dtype != np.float64:
         refuse(path, "its numbers have 64 bits", 'first call jax.config.update("jax_enable_x64", True)')
-    leaves: dict[str, dict[str, Any]] = dict(header["leaves"])
-    leaves.pop("/rise", None)  # `state.stop` says it
-
-    def differs(place: str, problem: str) -> NoReturn:
-        problem = f"another structure at {place.strip('/')}: {problem} (it was written by nnap_em {header['version']}"
-        refuse(path, f"{problem}, this is {__version__})", "identify again with this version")
-
-    def leaf(place: str, value: Any) -> Any:
-        if place not in leaves:
-            differs(place, "missing in the file")
-        entry, array = leaves.pop(place), arrays.get(place)
-        if entry["is"] == "code" and name_of(value) != entry["of"]:
-            differs(place, f"{entry['of']!r} in the file")
-        if entry["is"] not in ("code", "plain"):
-            axes = None if entry["is"] == "key" or value is None else np.ndim(value)
-            if array is None or callable(value) or axes not in (None, array.ndim):
-                differs(place, "of another shape" if array is not None else "no array in the file")
-        return restore(entry, array, value)
-
-    known = {kind.__name__: kind for kind in (*catalogue.values(), *parts)}
-    effects = tuple(_drawn(path, sketch, "effect", known) for sketch in header["effects"])
-    tree = _tree(begin(rig, _blank(rig), key=jax.random.key(0), effects=effects))
-    tree["smoother"] = _drawn(path, header["smoother"], "smoother", kinds)
-    tree = walk(tree, leaf)
-    for place, entry in leaves.items():
-        if entry.get("of", entry):  # what is gone and was empty changes nothing
-            differs(place, "unknown here")
-    return Identified(rig=rig, **tree)
+    try:
+        stored = Stored(_fit(header["fit"], arrays), header["fingerprint"], header["notes"])
+    except (KeyError, TypeError) as error:
+        by = f"written by nnap_em {header['version']}, this is {__version__}"
+        refuse(path, f"not as here: {error} ({by})", "first import what adds its parts, or identify again")
+    if stored.fitted.rig.system not in systems:
+        problem = f"its system {stored.fitted.rig.system!r} is not registered here"
+        refuse(path, problem, f"registered are {', '.join(systems)}")
+    return stored
 
 
-def _sketch(path: Path, node: Any) -> Any:
-    """The structure of an effect or a smoother as JSON: modules by name, arrays by their number of axes."""
-    if isinstance(node, eqx.Module):
-        kind = type(node)
-        parts = {f.name: _sketch(path, getattr(node, f.name)) for f in dataclasses.fields(node)}
-        return {"kind": kind.__name__, "parts": parts}
-    if isinstance(node, tuple) and not plain(node):
-        return {"items": [_sketch(path, item) for item in node]}
-    if not (eqx.is_array(node) or plain(node)):
-        refuse(path, f"an effect or smoother has a {type(node).__name__}", "modules, arrays and numbers can be stored")
-    return {"axes": np.ndim(node)} if eqx.is_array(node) else {"plain": node}
+def _fit(form: Any, arrays: Mapping[str, np.ndarray]) -> Identified:
+    def leaf(place: str, entry: dict[str, Any]) -> Any:
+        array = None if entry["is"] in ("plain", "code") else arrays[place]
+        return restore(entry, array, _CODE[entry["of"]] if entry["is"] == "code" else None)
 
-
-def _drawn(path: Path, sketch: Mapping[str, Any], noun: str, known: Mapping[str, type]) -> Any:
-    """An effect or smoother of that structure, of `known` kinds, to put the numbers in."""
-    if "kind" in sketch:
-        if sketch["kind"] not in known:
-            refuse(path, f"its {noun} {sketch['kind']!r} is not known here", "first import what adds it")
-        skeleton = object.__new__(known[sketch["kind"]])
-        for name, part in sketch["parts"].items():
-            object.__setattr__(skeleton, name, _drawn(path, part, noun, known))
-        return skeleton
-    if "items" in sketch:
-        return tuple(_drawn(path, item, noun, known) for item in sketch["items"])
-    return jnp.zeros((1,) * sketch["axes"]) if "axes" in sketch else tuples(sketch["plain"])
-
-
-def _rig(entries: Mapping[str, Any]) -> Rig:
-    values: dict[str, Any] = {name: tuples(value) for name, value in entries.items()}
-    if not values.get("memory"):  # of a version whose friction could have one
-        values.pop("memory", None)
-    for part in ("parameters", "start"):
-        values[part] = {name: Declared(**pair) for name, pair in entries[part].items()}
-    pairs = lambda table: {name: tuple(pair) for name, pair in table.items()}  # noqa: E731
-    values["limits"] = Bounds(**{part: pairs(table) for part, table in entries["limits"].items()})
-    values["ranges"] = pairs(entries["ranges"])
-    return Rig(**values)
-
-
-def _blank(rig: Rig, rows: int = 32) -> Dataset:
-    """Placeholder logs of the right shape; all their numbers are replaced by those of the file."""
-    t = rig.dt * np.arange(rows)
-    swing = np.sin(t / t[-1])[None, :, None]
-    u, y = (np.repeat(swing, n, axis=2) for n in (len(rig.input_columns), len(rig.measured)))
-    return Dataset(t[None], u, y, np.ones((1, rows), bool))
+    return tree_of(form, leaf)

@@ -1,9 +1,10 @@
-"""Digest of a tree, in every process alike: numbers to the last bit, types and functions by name."""
+"""Trees by their parts: as JSON, and as a digest, in every process alike, numbers to the last bit, code by name."""
 
 import dataclasses
 import functools
 import hashlib
 import importlib.metadata
+import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, TypeGuard
@@ -34,6 +35,42 @@ def parts(node: Any) -> dict[str, Any] | None:
     if isinstance(node, tuple | list):
         return dict(zip(getattr(node, "_fields", map(str, range(len(node)))), node, strict=True))
     return None
+
+
+def form_of(node: Any, leaf: Callable[[str, Any], Any], place: str = "") -> Any:
+    """JSON of a tree: kind and parts of each node, and `leaf(place, value)`, no list, for each leaf."""
+    if (inside := parts(node)) is None:
+        return leaf(place, node)
+    kind = type(node)
+    forms = {name: form_of(part, leaf, f"{place}/{name}") for name, part in inside.items()}
+    return [f"{kind.__module__}:{kind.__qualname__}", forms]
+
+
+def tree_of(form: Any, leaf: Callable[[str, Any], Any], place: str = "") -> Any:
+    """The tree that `form_of` described, with `leaf(place, entry)` for each leaf: data, no code of its kinds is run.
+
+    Raises TypeError for a kind that is not loaded, or has other parts here.
+    """
+    if not isinstance(form, list):
+        return leaf(place, form)
+    module, _, name = form[0].partition(":")
+    kind: Any = getattr(sys.modules.get(module), name, None)
+    values = {part: tree_of(inside, leaf, f"{place}/{part}") for part, inside in form[1].items()}
+    if kind is dict:
+        return values
+    if kind in (tuple, list):
+        return kind(values.values())
+    fields = getattr(kind, "_fields", None)
+    if isinstance(kind, type) and dataclasses.is_dataclass(kind):
+        fields = [field.name for field in dataclasses.fields(kind)]
+    if fields is None or list(fields) != list(values):
+        raise TypeError(f"{form[0]} at {place.strip('/')} is not loaded, or of another structure")
+    if issubclass(kind, tuple):
+        return kind._make(values.values())
+    copy = object.__new__(kind)  # as equinox itself does: `__init__` may take other arguments
+    for part, value in values.items():
+        object.__setattr__(copy, part, value)
+    return copy
 
 
 def full_name(code: Any) -> str:

@@ -10,7 +10,6 @@ kept.
 import json
 import logging
 import os
-import sys
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
@@ -21,7 +20,7 @@ import jax
 from jax.core import Tracer
 from jax.sharding import Mesh
 
-from .digest import digest, full_name, surroundings
+from .digest import digest, form_of, full_name, surroundings, tree_of
 
 
 class _Programs:
@@ -57,44 +56,49 @@ def _ready(run: Callable, function: Callable, arguments: Any, folder: Path) -> C
     """The program, from the cache, or traced and put there; None where it cannot be kept."""
     dynamic, static = eqx.partition(arguments, eqx.is_array)
     arrays, inside = jax.tree.flatten(dynamic)
+    structures = []
+
+    def flat(*arrays):
+        out, outside = jax.tree.flatten(run(*eqx.combine(jax.tree.unflatten(inside, arrays), static)))
+        structures.append(outside)
+        return out
+
     try:
         path = folder / _key(function, arrays, static)
-    except TypeError as error:
+        entry = _read(path)
+        if entry is None:
+            platforms = (jax.export.default_export_platform(),)
+            exported = jax.export.export(_compiled(flat, run), platforms=platforms)(*arrays)
+            entry = exported, structures[-1]
+            form = form_of(jax.tree.unflatten(entry[1], exported.out_avals), _mark)
+            _write(path, json.dumps(form).encode() + b"\n" + exported.serialize())
+    except Exception as error:  # not everything can be written down; a mistake of `run` is raised by `run`
         logging.getLogger(__name__).debug("%s is not kept: %s", run.__name__, error)
         return None
-    entry = _read(path)
-    if entry is None:
-        structures = []
-
-        def flat(*arrays):
-            out, outside = jax.tree.flatten(run(*eqx.combine(jax.tree.unflatten(inside, arrays), static)))
-            structures.append(outside)
-            return out
-
-        flat.__name__ = flat.__qualname__ = run.__name__
-        try:
-            exported = jax.export.export(jax.jit(flat), platforms=(jax.export.default_export_platform(),))(*arrays)
-            form = _form(jax.tree.unflatten(structures[-1], [0] * structures[-1].num_leaves))
-            _write(path, json.dumps(form).encode() + b"\n" + exported.serialize())
-        except Exception as error:  # not everything can be written down; a mistake of `run` is raised by `run`
-            logging.getLogger(__name__).debug("%s is not kept: %s", run.__name__, error)
-            return None
-        entry = exported, structures[-1]
     exported, outside = entry
-
-    def again(*arrays):
-        return exported.call(*arrays)
-
-    again.__name__ = again.__qualname__ = run.__name__
-    program = jax.jit(again)
+    program = _compiled(lambda *arrays: exported.call(*arrays), run)
     return lambda *arrays: jax.tree.unflatten(outside, program(*arrays))
 
 
+def _compiled(function: Callable, run: Callable) -> Any:
+    """`function`, compiled under the name of `run`."""
+    function.__name__ = function.__qualname__ = run.__name__
+    return jax.jit(function)
+
+
+def _mark(place: str, value: Any) -> int | None:
+    """Mark of a leaf in the form of an outcome; TypeError for one that is no array."""
+    if value is not None and not isinstance(value, jax.core.ShapedArray):
+        raise TypeError(f"a {type(value).__name__} in its outcome")
+    return None if value is None else 0
+
+
 def _read(path: Path) -> tuple[jax.export.Exported, Any] | None:
-    """Entry of the cache; None where there is none, or a damaged one."""
+    """Program and structure of its outcome, from the cache; None where there is none, or a damaged one."""
     try:
         form, _, program = path.read_bytes().partition(b"\n")
-        return jax.export.deserialize(bytearray(program)), jax.tree.structure(_tree(json.loads(form)))
+        outcome = tree_of(json.loads(form), lambda place, mark: mark)
+        return jax.export.deserialize(bytearray(program)), jax.tree.structure(outcome)
     except Exception as error:  # whatever it is that was damaged: it is made anew
         logging.getLogger(__name__).debug("no kept program: %s", error)
         return None
@@ -110,28 +114,6 @@ def _write(path: Path, entry: bytes) -> None:
             part.replace(path)
         finally:
             part.unlink(missing_ok=True)
-
-
-def _form(tree: Any) -> Any:
-    """JSON of an outcome with 0 for each array: the kind of a tuple or list, then its entries.
-
-    Raises TypeError for another kind of node.
-    """
-    if isinstance(tree, tuple | list):
-        return [f"{type(tree).__module__}:{type(tree).__qualname__}", *map(_form, tree)]
-    if tree not in (None, 0):
-        raise TypeError(f"a {type(tree).__name__} in its outcome")
-    return tree
-
-
-def _tree(form: Any) -> Any:
-    """The outcome that `_form` describes: data, of which nothing but named tuples, tuples and lists is made."""
-    if not isinstance(form, list):
-        return form
-    kind, *entries = form
-    module, _, name = kind.partition(":")
-    make = {"builtins:tuple": tuple, "builtins:list": list}.get(kind) or getattr(sys.modules[module], name)._make
-    return make(map(_tree, entries))
 
 
 def _shape(a: jax.Array) -> tuple[tuple[int, ...], Any, bool]:

@@ -1,29 +1,12 @@
 """Leaves of a tree, each an entry of a JSON header and, if it is an array, the array: back to the last bit."""
 
-from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..numerics.digest import is_key, parts, plain
-
-
-def walk(node: Any, leaf: Callable[[str, Any], Any], place: str = "") -> Any:
-    """A copy of a tree with `leaf(place, value)` for each leaf: an array, a function or a plain value."""
-    inside = None if plain(node) else parts(node)
-    if inside is None:
-        return leaf(place, node)
-    inside = {name: walk(part, leaf, f"{place}/{name}") for name, part in inside.items()}
-    if isinstance(node, dict):
-        return inside
-    if isinstance(node, tuple | list):
-        return type(node)(*inside.values()) if hasattr(node, "_fields") else type(node)(inside.values())
-    copy = object.__new__(type(node))  # as equinox itself does: `__init__` may take other arguments
-    for name, part in inside.items():
-        object.__setattr__(copy, name, part)
-    return copy
+from ..numerics.digest import is_key, plain
 
 
 def tuples(value: Any) -> Any:

@@ -82,7 +82,7 @@ def _columns(
     def driven(system, servos, q, v, u):
         if not servos:
             return jnp.zeros_like(q)
-        (fed,) = hooks.fed((), servos, system, u[None], hooks.Sampling(1.0))
+        (fed,), _ = hooks.arriving((), servos, system, u[None], hooks.Sampling(1.0).through)
         return system.drive(hooks.driven((), servos, system, fed, q, v))
 
     def force(values, a):

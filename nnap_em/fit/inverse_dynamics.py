@@ -197,7 +197,7 @@ def motion_along(rig: Rig, system: AbstractSystem, data: Dataset) -> Motion | No
     fed = np.asarray(data.u, float)[..., : len(system.joints)]
     still, sampled = fed == 0, hooks.Sampling(rig.dt, rig.input_hold == SMOOTH)
     if servos:
-        fed = jax.vmap(lambda u: hooks.fed((), servos, system, u, sampled))(jnp.asarray(fed))
+        fed = jax.vmap(lambda u: hooks.arriving((), servos, system, u, sampled.through)[0])(jnp.asarray(fed))
     y, u, still = (_pieces(np.asarray(part, float), valid) for part in (data.y, fed, still))
     value, slope, bend = (savgol_coeffs(WIDTH, ORDER, deriv, rig.dt, use="dot") for deriv in range(3))
     # an acceleration is the mean of the true one with a window, of readings of the position or of the rate

@@ -20,7 +20,7 @@ from nnap_em.model.servo import Servo
 from nnap_em.model.simulate import paper_experiment, paper_model
 from nnap_em.model.state_space import with_effects
 from nnap_em.smoother.kalman import CUBATURE, ekf
-from nnap_em.smoother.mixture import mixture_filter
+from nnap_em.smoother.mixture import alone, mixture_filter
 from nnap_em.systems import specs
 
 NUMBER = lambda x: jnp.asarray(x, float)  # noqa: E731
@@ -151,11 +151,9 @@ def test_branches_are_those_of_the_mixture(acrobot, monkeypatch):
     monkeypatch.setattr(observing, "BRANCH_END", 1e-300)
     monkeypatch.setattr(observing, "TWIN", 0.0)
     start, step = functions(model, (0, 1), restart_prior(model), 8)
-    begin = jax.tree.map(lambda a: jnp.broadcast_to(a, (8, *a.shape)), model.start)
-    weight = jnp.where(jnp.arange(8) == 0, 0.0, -jnp.inf)
     both = jax.jit(jax.vmap(lambda data: _states(start, step, data)))(every)
     states = jax.tree.map(lambda a: a[0], both)
-    tree = jax.jit(lambda: mixture_filter(model, begin, weight, prepare(model, data), CUBATURE, (0, 1)))()
+    tree = jax.jit(lambda: mixture_filter(model, *alone(model.start, 8), prepare(model, data), CUBATURE, (0, 1)))()
     best = np.argmax(tree.rows.loglik, axis=1)
     np.testing.assert_allclose(states.mean, tree.rows.state.mean[np.arange(100), best], rtol=1e-7, atol=1e-8)
     assert np.isfinite(tree.rows.loglik[50]).sum() > 4 and states.weight.min() < 0.5  # all places were in use

@@ -21,7 +21,7 @@ from ..model.friction import FrictionNetwork
 from ..model.state_space import Inputs, StateSpaceModel
 from ..numerics.gaussian import MOST_UNROLLED, Gaussian, symmetric
 from ..smoother.kalman import CUBATURE, absorbed, linear_reading, moved
-from ..smoother.mixture import WIDE_STD, Components, merged, split
+from ..smoother.mixture import WIDE_STD, Components, alone, merged, split
 from .identify import Identified
 
 GATE = 6.0
@@ -104,17 +104,12 @@ class _Row(NamedTuple):
     """Inputs and readings of one row, as the filter takes them: `held` over the interval before, `here` at readings."""
 
     first: Bool[Array, ""]
-    u: Float[Array, " column"]
-    memory: Any
     y: Float[Array, " obs"]
     read: Bool[Array, " obs"]
-    late: Float[Array, " obs"]
     gate: Float[Array, ""]
     held: Inputs
     here: Inputs
     flags: Int[Array, ""]
-    time: Float[Array, ""]
-    age: Float[Array, ""]
 
 
 def observer(fitted: Identified) -> Observer:
@@ -172,13 +167,9 @@ def functions(
     columns = drives + len({place for servo in model.servos or () for _, place, _ in servo.scales})
     zero = jnp.zeros((), dtype)
 
-    def alone(prior: Gaussian) -> tuple[Gaussian, Float[Array, " branch"]]:
-        every = jax.tree.map(lambda a: jnp.broadcast_to(a, (branches, *a.shape)), prior)
-        return every, jnp.where(jnp.arange(branches) == 0, zero, -jnp.inf)
-
     nothing = jnp.zeros(len(waits), dtype)
     blank = _Memory(
-        *alone(model.start), commands.memory, jnp.zeros(columns, dtype), jnp.zeros(drives, dtype),
+        *alone(model.start, branches), commands.memory, jnp.zeros(columns, dtype), jnp.zeros(drives, dtype),
         past=jnp.zeros(drives, dtype), late=nothing + jnp.nan, time=zero, age=zero - model.dt, rows=zero,
     )  # fmt: skip
     unpacked = ravel_pytree(blank)[1]
@@ -187,7 +178,7 @@ def functions(
         begun = blank._replace(time=jnp.asarray(time, dtype) - model.dt)
         return Observation(*model.start, nothing, zero + 1, zero + 1, jnp.asarray(0), ravel_pytree(begun)[0])
 
-    def taken(state: _Memory, u: Float[Array, " column"], y: Float[Array, " obs"]) -> _Row:
+    def taken(state: _Memory, u: Float[Array, " column"], y: Float[Array, " obs"]) -> tuple[_Row, _Memory]:
         first, sound, read = state.age < -0.5 * model.dt, jnp.isfinite(u), jnp.isfinite(y)
         u = jnp.where(first & (not smooth), 0.0, jnp.where(sound, u, state.u))
         memory, fed = commands.step(state.commands, u, first if smooth else state.age < 0.5 * model.dt)
@@ -201,12 +192,11 @@ def functions(
             bend = jnp.where(state.age > 0.5 * model.dt, change - state.fed + state.past, 0.0)
             held = held._replace(u=state.fed, scale=scaled, course=jnp.stack([change, bend]))
             here = here._replace(before=state.fed, course=jnp.zeros((2, drives), dtype))
-        return _Row(
-            first=first, u=u, memory=memory, y=jnp.where(read, y, 0.0), read=read & ~waits,
-            late=jnp.where(read & waits, y, jnp.nan), gate=jnp.where(state.rows < SETTLING, jnp.inf, GATE),
-            held=held, here=here,
-            flags=_bits({MISSING: ~jnp.all(read), NO_INPUT: ~jnp.all(sound) & (smooth | ~first)}), time=time, age=age,
-        )  # fmt: skip
+        gate = jnp.where(state.rows < SETTLING, jnp.inf, GATE)
+        flags = _bits({MISSING: ~jnp.all(read), NO_INPUT: ~jnp.all(sound) & (smooth | ~first)})
+        late, rows = jnp.where(read & waits, y, jnp.nan), jnp.minimum(state.rows + 1, SETTLING)
+        after = _Memory(state.branches, state.log_weight, memory, u, fed, state.fed, late, time, age, rows)
+        return _Row(first, jnp.where(read, y, 0.0), read & ~waits, gate, held, here, flags), after
 
     def filtered(x: Gaussian, row: _Row, late: Float[Array, " obs"]) -> tuple[Gaussian, Array, Array]:
         before = jnp.zeros_like(late), jnp.zeros_like(late)
@@ -219,7 +209,7 @@ def functions(
 
     def step(before: Observation, u: Float[Array, " column"], y: Float[Array, " obs"]) -> Observation:
         state = unpacked(before.memory)
-        row, live = taken(state, u, y), jnp.isfinite(state.log_weight)
+        (row, after), live = taken(state, u, y), jnp.isfinite(state.log_weight)
         best = jnp.argmax(state.log_weight)
         every, innovation, log_variance = _every(
             lambda x: filtered(x, row, state.late), state.branches, best, jnp.sum(live) == 1
@@ -235,16 +225,15 @@ def functions(
         innovation = jnp.where(sane, innovation[best], 0.0)
 
         afresh, *_ = absorbed(again, linear_reading(model, again.mean, row.here), r, row.y, row.read)
-        every, log_weight = jax.tree.map(lambda a, b: jnp.where(sane, a, b), (every, log_weight), alone(afresh))
+        every, log_weight = jax.tree.map(
+            lambda a, b: jnp.where(sane, a, b), (every, log_weight), alone(afresh, branches)
+        )
         if branches > 1:
             every, log_weight = _branched(every, log_weight, angles)
         best = jnp.argmax(log_weight)
         (mean, cov), log_weight = jax.tree.map(lambda a: a[best], every), log_weight - log_weight[best]
         outlier, ambiguous = jnp.any(innovation**2 > row.gate**2), jnp.sum(jnp.isfinite(log_weight)) > 1
-        after = _Memory(
-            every, log_weight, row.memory, row.u, row.here.u, state.fed, row.late, row.time, row.age,
-            jnp.where(sane, jnp.minimum(state.rows + 1, SETTLING), 1.0),
-        )  # fmt: skip
+        after = after._replace(branches=every, log_weight=log_weight, rows=jnp.where(sane, after.rows, 1.0))
         return Observation(
             mean, cov, innovation, jnp.where(sane, misfit, 1.0), 1 / jnp.sum(jnp.exp(log_weight)),
             row.flags + _bits({OUTLIER: outlier, RESTARTED: ~sane, AMBIGUOUS: ambiguous}), ravel_pytree(after)[0],

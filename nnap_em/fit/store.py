@@ -4,7 +4,6 @@ The file is an npz: one member per array, named by its place in the tree, and a 
 nodes by name, and the plain values. No code is stored, and none of a kind is run on loading.
 """
 
-import hashlib
 import inspect
 from collections.abc import Mapping
 from pathlib import Path
@@ -17,7 +16,7 @@ import numpy as np
 
 from .. import __version__, smoothers  # noqa: F401
 from ..data.dataset import Dataset
-from ..numerics.digest import form_of, tree_of
+from ..numerics.digest import digest, form_of, tree_of
 from ..storage.files import Kind, read_arrays, refuse, write_arrays
 from ..storage.leaves import describe, restore
 from ..systems import systems
@@ -56,8 +55,7 @@ def model_file(path: Path) -> Path:
 
 def fingerprint(data: Dataset) -> str:
     """SHA-256 of the content of `data`, to recognise the same data later."""
-    arrays = [np.asarray(part) for part in data]
-    return hashlib.sha256(b"".join(f"{a.dtype.str}{a.shape}".encode() + a.tobytes() for a in arrays)).hexdigest()
+    return digest(data)
 
 
 def save(

@@ -34,7 +34,7 @@ class RK4(diffrax.AbstractSolver):
         return terms.vf(t0, y0, args)
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
-        """The value after one step; `terms` is a function of time and value."""
+        """The value after one step, entry by entry: a batch of states is then one of each entry, without strides."""
         h = jnp.asarray(t1 - t0)
         times = t0 + h * jnp.asarray([0.0, 0.5, 0.5, 1.0], h.dtype)
         ahead = h * jnp.asarray([1 / 2, 1 / 2, 1.0, 1 / 6], h.dtype)
@@ -42,15 +42,14 @@ class RK4(diffrax.AbstractSolver):
 
         def stage(carry, slices):
             (point, y1), (t, ahead, share) = carry, slices
-            slope = terms.vf(t, tuple(point) if isinstance(y0, tuple) else jnp.stack(point), args)
-            after = [a + ahead * slope[i] for i, a in enumerate(start)]
-            return (after, [a + share * point[i] for i, a in enumerate(y1)]), None
+            slope = terms.vf(t, tuple(point), args)
+            after = [a + ahead * b for a, b in zip(start, slope, strict=True)]
+            return (after, [a + share * b for a, b in zip(y1, point, strict=True)]), None
 
-        start = list(y0)  # entry by entry: a batch of states is then a batch of each entry, without strides
+        start = list(y0)
         nothing = [a - a for a in start]  # batched as the loop's results are, which is then traced once, not twice
         (last, y1), _ = jax.lax.scan(stage, (start, nothing), (times, ahead, share))
-        y1 = [a + b for a, b in zip(y1, last, strict=True)]
-        y1 = tuple(y1) if isinstance(y0, tuple) else jnp.stack(y1)
+        y1 = tuple(a + b for a, b in zip(y1, last, strict=True))
         return y1, None, {"y0": y0, "y1": y1}, None, diffrax.RESULTS.successful
 
 

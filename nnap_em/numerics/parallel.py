@@ -135,11 +135,15 @@ def on_default_device(tree: Any) -> Any:
 
     A program is compiled once for arrays that are bound to a device, and once more where one of them is not.
     """
-    home = jax.local_devices()[0]
-    abroad = lambda a: isinstance(a, jax.Array | np.ndarray) and not _bound_to(a, home)  # noqa: E731
-    arrays, others = eqx.partition(tree, abroad)  # to put a whole model where it is takes milliseconds
     if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree)):
         return tree
+    home = jax.local_devices()[0]
+
+    def abroad(a: Any) -> bool:
+        at_home = isinstance(a, jax.Array) and a.committed and a.devices() == {home}
+        return isinstance(a, jax.Array | np.ndarray) and not at_home
+
+    arrays, others = eqx.partition(tree, abroad)  # to put a whole model where it is takes milliseconds
     return eqx.combine(jax.device_put(arrays, home), others)
 
 
@@ -148,11 +152,6 @@ def _by_numbers(change: Callable, a: Any) -> Any:
     if not is_key(a):
         return change(np.asarray(a))
     return jax.random.wrap_key_data(change(np.asarray(jax.random.key_data(a))), impl=jax.random.key_impl(a))
-
-
-def _bound_to(a: Any, device: Any) -> bool:
-    """True where an array is committed to this device, and to no other."""
-    return isinstance(a, jax.Array) and not isinstance(a, Tracer) and a.committed and a.devices() == {device}
 
 
 def _place(tree, sharding: NamedSharding):

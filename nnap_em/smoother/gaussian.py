@@ -1,7 +1,6 @@
 """Gaussian smoothers: filter and RTS passes from the likeliest start, relinearised about their own path."""
 
 import dataclasses
-import math
 
 import equinox as eqx
 import jax
@@ -9,7 +8,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from ..model.base import AbstractModel, Prepared
-from ..numerics.gaussian import Gaussian
 from .kalman import Cubature, Filtered, Smoothed, Tangent, ekf, linear_posterior, relinearised, rts
 from .mixture import MixtureSmoother
 from .posterior import AbstractSmoother, Posterior, likeliest
@@ -25,8 +23,8 @@ class GaussianSmoother(AbstractSmoother):
     """Samples over which the hypotheses compete."""
     iterations: int = eqx.field(static=True, default=1)
     """Relinearisations about the smoothed path: Gauss-Newton steps on the path."""
-    inflations: tuple[float, ...] = eqx.field(static=True, default=(1.0,))
-    """Process noise of the first pass, which decides only where the second one linearises, over that of the model: a
+    inflations: Float[Array, " pass"] = eqx.field(default=(1.0,), converter=jnp.asarray)
+    """Process noise of each first pass, which decides only where the second one linearises, over that of the model: a
     looser filter follows where a tight one diverges."""
     branching: bool = eqx.field(static=True, default=True)
     """False: one Gaussian only, also where an angle that is not read is wide."""
@@ -39,37 +37,33 @@ class GaussianSmoother(AbstractSmoother):
         """The mixture, where an angle is not read and more than one branch is to be followed."""
         return MixtureSmoother(self.bank.angles, self.linearise) if self.branching and self.bank.angles else None
 
-    def tries(self) -> "list[_Loosened]":
+    def tries(self) -> "list[GaussianSmoother]":
         """One for each of the first passes."""
-        once = dataclasses.replace(self, inflations=(1.0,), branching=False)  # one program, with `second` or without
-        return [_Loosened(once, jnp.asarray(math.log(factor), float)) for factor in self.inflations]
+        passes = jnp.split(self.inflations, len(self.inflations))
+        # One program, with `second` or without
+        return [dataclasses.replace(self, inflations=one, branching=False) for one in passes]
 
     def path(self, model, seq: Prepared) -> tuple[Filtered, Smoothed]:
         """Filtered and smoothed states of the last iteration."""
         return self.tracked(model, seq)[:2]
 
     def tracked(self, model, seq: Prepared) -> tuple[Filtered, Smoothed, Float[Array, ""]]:
-        """Filtered and smoothed states of the last iteration, and the width of the first pass."""
-        start = self.bank.likeliest(model, seq, self.linearise, self.window)
-        looser = jnp.log(jnp.asarray(self.inflations, seq.y.dtype))
-        filtered, smoothed, width = jax.vmap(lambda looser: self.follow(model, seq, start, looser))(looser)
-        best = likeliest(filtered.loglik)
-        return *jax.tree.map(lambda a: a[best], (filtered, smoothed)), width[0]
-
-    def follow(
-        self, model, seq: Prepared, start: Gaussian, looser: Float[Array, ""]
-    ) -> tuple[Filtered, Smoothed, Float[Array, ""]]:
-        """Smoothing from one start, the log of the process noise of the first pass `looser` than that of the model, and
-        `width` of that pass.
+        """Filtered and smoothed states of the last iteration from the likeliest start, by the likeliest of the first
+        passes, and `width` of the first of these.
         """
-        filtered = ekf(eqx.tree_at(lambda m: m.log_q, model, model.log_q + looser), start, seq, self.linearise)
+        start = self.bank.likeliest(model, seq, self.linearise, self.window)
 
         def again(_, latest):
             filtered = relinearised(model, latest[1].state, seq, self.linearise)
             return filtered, rts(filtered)
 
-        smoothed = jax.lax.fori_loop(0, self.iterations, again, (filtered, rts(filtered)))
-        return *smoothed, self.width(filtered, seq)
+        def follow(looser):
+            first = ekf(eqx.tree_at(lambda m: m.log_q, model, model.log_q + looser), start, seq, self.linearise)
+            return *jax.lax.fori_loop(0, self.iterations, again, (first, rts(first))), self.width(first, seq)
+
+        *paths, width = jax.vmap(follow)(jnp.log(self.inflations.astype(seq.y.dtype)))
+        best = likeliest(paths[0].loglik)
+        return *jax.tree.map(lambda a: a[best], paths), width[0]
 
     def width(self, filtered: Filtered, seq: Prepared) -> Float[Array, ""]:
         """Largest standard deviation of the angles given the readings so far [rad], 0 where they need no mixture; rows
@@ -86,18 +80,6 @@ class GaussianSmoother(AbstractSmoother):
     def __call__(self, model: AbstractModel, seq: Prepared, *, key: PRNGKeyArray | None = None) -> Posterior:
         """Smooth one sequence; it draws nothing."""
         return linear_posterior(*self.tracked(model, seq))
-
-
-class _Loosened(AbstractSmoother):
-    """One try of a Gaussian smoother; how loose it is is no part of the program."""
-
-    smoother: GaussianSmoother
-    looser: Float[Array, ""]
-
-    def __call__(self, model: AbstractModel, seq: Prepared, *, key: PRNGKeyArray | None = None) -> Posterior:
-        one = self.smoother
-        start = one.bank.likeliest(model, seq, one.linearise, one.window)
-        return linear_posterior(*one.follow(model, seq, start, self.looser))
 
 
 def ExtendedKalmanSmoother(bank: StartBank, **options) -> GaussianSmoother:

@@ -54,6 +54,12 @@ class Tree(NamedTuple):
     """Log weights of the last row."""
 
 
+def alone(prior: Gaussian, places: int) -> tuple[Gaussian, Float[Array, " {places}"]]:
+    """One component, and places that are free, with their log weights."""
+    every = jax.tree.map(lambda a: jnp.broadcast_to(a, (places, *a.shape)), prior)
+    return every, jnp.where(jnp.arange(places) == 0, jnp.zeros((), prior.mean.dtype), -jnp.inf)
+
+
 def split(before: Components, angles: tuple[int, ...], wide: float) -> Components:
     """Two more places: the likeliest component that is wide along an angle becomes three, on its regression on that."""
     (mean, cov), log_weight, source = before
@@ -178,9 +184,7 @@ class MixtureSmoother(AbstractSmoother):
         likelihood -inf where there is none; with it the likelihoods about the paths that these began from.
         """
         if kept is None:
-            start = jax.tree.map(lambda a: jnp.broadcast_to(a, (self.components, *a.shape)), model.start)
-            log_weight = jnp.where(jnp.arange(self.components) == 0, 0.0, -jnp.inf)
-            tree = mixture_filter(model, start, log_weight, seq, self.linearise, self.angles)
+            tree = mixture_filter(model, *alone(model.start, self.components), seq, self.linearise, self.angles)
             ends = jnp.arange(self.components)
             paths = jax.vmap(lambda last: rts(branch(tree, last)).state)(ends)
             followed = jnp.isfinite(tree.log_weight)

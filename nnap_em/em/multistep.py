@@ -176,12 +176,8 @@ def _wide(model: StateSpaceModel, prior: ParameterPrior, path: Gaussian, data: D
     mean = np.asarray(path.mean)
     rates = np.where(np.asarray(data.valid)[..., None], mean[..., dof:states], np.nan)
     with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # of sequences that are nowhere known
-        if dof:
-            rms = np.sqrt(np.nanmean(rates**2, axis=(0, 1)))
-            spread = [SLOPE_WIDTH * HORIZONS[0] * rms, SLOPE_WIDTH * rms]
-        else:
-            spread = [SLOPE_WIDTH * np.nanstd(rates, axis=(0, 1)) + 1e-9]
-    spread = np.concatenate([*spread, np.full(mean.shape[-1] - states, 1e-6)])
+        width = SLOPE_WIDTH * np.sqrt(np.nanmean(rates**2, axis=(0, 1)))
+    spread = np.concatenate([HORIZONS[0] * width, width, np.full(mean.shape[-1] - states, 1e-6)])
     wide = Gaussian(path.mean, jax.device_put(np.broadcast_to(np.diag(spread**2), path.cov.shape)))
     linear = locals_along(model, prior, wide, data, CUBATURE)
     offset = np.asarray(linear.ahead) - np.einsum("stij,stj->sti", linear.affine.matrix, mean)

@@ -52,10 +52,8 @@ def third_differences(y) -> float:
 
 def white_readings(data: Dataset, model: StateSpaceModel) -> bool:
     """True where the readings of all measured coordinates carry white noise that is sampled as it is, or where none is
-    measured, one other: rates may change within a sample. Equations, whose horizons are long, need more than that.
+    measured, one other: rates may change within a sample.
     """
-    if model.system.simulated:
-        return False
     lags = [third_differences(y) for y in np.moveaxis(np.asarray(data.y), -1, 0)]
     dof = len(model.system.coordinates)
     coordinates = [lag for lag, place in zip(lags, model.measured, strict=True) if place < dof]

@@ -23,7 +23,6 @@ from ..em.multistep import JUDGED, LEAST_FALL, errors, finish, followed, ratio
 from ..em.prior import ParameterPrior
 from ..em.readings import white_readings
 from ..em.stated import widened
-from ..em.weights import Weights
 from ..model.state_space import StateSpaceModel, with_effects
 from ..numerics.digits import counted
 from ..smoother.gaussian import CubatureSmoother
@@ -241,11 +240,7 @@ def fitted_to_horizon(fitted: Identified, data: Dataset) -> Identified:
 
 def phi_samples(fitted: Identified, count: int, *, key: PRNGKeyArray) -> Float[Array, "sample phi"]:
     """Deviations of node torques [N m] and parameters from the mode, drawn from their posterior (Laplace)."""
-    return _drawn(fitted.state.hessian, count, key)
-
-
-@eqx.filter_jit
-def _drawn(precision: Float[Array, "phi phi"], count: int, key: PRNGKeyArray) -> Float[Array, "sample phi"]:
+    precision = fitted.state.hessian
     unit = jax.random.normal(key, (precision.shape[0], count), precision.dtype)
     return jax.scipy.linalg.solve_triangular(jnp.linalg.cholesky(precision).T, unit, lower=False).T
 
@@ -272,26 +267,19 @@ def friction_table(fitted: Identified, velocity: Float[Array, "dof node"]) -> Fr
         >>> nnap_em.friction_table(fit, jnp.linspace(-0.2, 0.2, 5)[None]).std.shape
         (1, 5)
     """
-    weights = fitted.m_step.weights(fitted.model)
-    w, model = weights.read(fitted.model), fitted.model
+    model, nodes = fitted.model, fitted.m_step.weights(fitted.model).nodes
     units = tuple((model.system.unit(rate), model.system.force_unit(j)) for j, rate in enumerate(model.system.rates, 1))
-    return FrictionTable(velocity, *_friction(weights, model.unknown, w, fitted.state.hessian, velocity), units)
+    return FrictionTable(velocity, *_friction(nodes, model.unknown, fitted.state.hessian, velocity), units)
 
 
 @eqx.filter_jit
-def _friction(weights: Weights, unknown, w, precision, velocity):
+def _friction(nodes, unknown, precision, velocity):
     """Torque at `velocity`, and its covariance: that of the nodes beside it."""
-    torque = jax.vmap(unknown.with_weights(w[: w.shape[0] - weights.prior.size]))(velocity.T).T
-    count = weights.nodes.shape[1]
+    dof, count = nodes.shape
+    cov = jnp.linalg.inv(precision)[: nodes.size, : nodes.size].reshape(dof, count, dof, count)
     between = jax.vmap(lambda nodes, v: jax.vmap(lambda e: jnp.interp(v, nodes, e))(jnp.eye(count, dtype=v.dtype)).T)
-    jac = jnp.zeros((*velocity.shape, precision.shape[0]), velocity.dtype)
-    for j, share in enumerate(between(weights.nodes, velocity)):
-        jac = jac.at[j, :, j * count : (j + 1) * count].set(share)
-    half = jax.scipy.linalg.solve_triangular(
-        jnp.linalg.cholesky(precision), jac.reshape(-1, jac.shape[-1]).T, lower=True
-    )
-    half = half.T.reshape(*velocity.shape, -1)
-    return torque, jnp.einsum("jaw,jbw->jab", half, half)
+    share = between(nodes, velocity)
+    return jax.vmap(unknown)(velocity.T).T, jnp.einsum("jan,jnjm,jbm->jab", share, cov, share)
 
 
 def parameter_table(fitted: Identified) -> dict[str, tuple[float, float]]:

@@ -309,14 +309,13 @@ def test_the_fit_of_the_smaller_errors_is_kept(chain, fit, monkeypatch):
 def test_an_input_that_takes_time_begins_as_it_is(chain):
     system, column = chain[0].model.system, jnp.asarray(chain[1].u)[0, :, 0]
     lag = catalogue["actuator_lag"].of(2.0, channel="u")
-    through = Sampling(0.5).through
-    lagged = np.asarray(late((lag,), None, system, column[:, None], through))[:, 0]
+    lagged = np.asarray(late((lag,), None, system, column[:, None], Sampling(0.5).through))[:, 0]
     keep, expected, held = np.exp(-0.5 / 2.0), [], float(column[0])
     for one in np.asarray(column):  # mean over each row of the exact response
         expected.append(one + (held - one) * 2.0 / 0.5 * (1 - keep))
         held = one + (held - one) * keep
     np.testing.assert_allclose(lagged, expected, rtol=1e-9)
-    np.testing.assert_array_equal(late((lag,), None, system, jnp.full((9, 1), 3.0), through), 3.0)
+    np.testing.assert_array_equal(late((lag,), None, system, jnp.full((9, 1), 3.0), Sampling(0.5).through), 3.0)
 
 
 def test_identify_finds_the_parameters_and_the_hidden_state(fit, tmp_path):

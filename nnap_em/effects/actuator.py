@@ -31,7 +31,6 @@ class InputEffect(DriveEffect):
 class MotorGain(InputEffect):
     """gain u."""
 
-    name: ClassVar[str] = "motor_gain"
     meaning: ClassVar[str] = "The drive delivers more or less than commanded, in a fixed proportion."
     confirm: ClassVar[str] = "Hold the output still (block the joint) and measure what the drive gives at one command."
     units: ClassVar[dict[str, str]] = {"gain": "-"}
@@ -53,7 +52,6 @@ class MotorGain(InputEffect):
 class DeadZone(InputEffect):
     """Nothing below width, sign(u) (|u| - width) beyond."""
 
-    name: ClassVar[str] = "dead_zone"
     meaning: ClassVar[str] = "Small commands have no effect."
     confirm: ClassVar[str] = "Raise the command slowly from zero until something moves, both ways."
     units: ClassVar[dict[str, str]] = {"width": "N m"}
@@ -74,7 +72,6 @@ class DeadZone(InputEffect):
 class Saturation(InputEffect):
     """Limited to +-limit."""
 
-    name: ClassVar[str] = "saturation"
     meaning: ClassVar[str] = "The drive cannot deliver more than a limit."
     confirm: ClassVar[str] = "Block the joint and raise the command until the torque stays; look at the current limit."
     units: ClassVar[dict[str, str]] = {"limit": "N m"}
@@ -94,7 +91,6 @@ class Saturation(InputEffect):
 class OneSidedLoss(InputEffect):
     """u on one side of zero, (1 - loss) u on the other: below zero for side = -1, above for 1."""
 
-    name: ClassVar[str] = "one_sided_loss"
     reported_as: ClassVar[str] = "unknown_function"
     confirm: ClassVar[str] = "Block the joint and measure its torque at one command, both ways."
     units: ClassVar[dict[str, str]] = {"loss": "-"}
@@ -121,7 +117,6 @@ class OneSidedLoss(InputEffect):
 class InputDelay(DriveEffect):
     """u acts later by any time; before the first row it was 0."""
 
-    name: ClassVar[str] = "input_delay"
     meaning: ClassVar[str] = "Commands act late."
     confirm: ClassVar[str] = "Log the command and what the drive gives, as its current, on one clock."
     units: ClassVar[dict[str, str]] = {"delay": "s"}
@@ -155,7 +150,6 @@ class InputDelay(DriveEffect):
 class ActuatorLag(DriveEffect):
     """First-order lag of time constant tau, the mean over each sample of the exact response."""
 
-    name: ClassVar[str] = "actuator_lag"
     meaning: ClassVar[str] = "The drive follows its command gradually."
     confirm: ClassVar[str] = "Log the command and what the drive gives, as its current, on one clock, for a step."
     units: ClassVar[dict[str, str]] = {"tau": "s"}

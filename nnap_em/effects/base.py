@@ -5,6 +5,7 @@ A new effect is one new file in this folder; the catalogue finds it.
 
 import dataclasses
 import itertools
+import re
 from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, NamedTuple
 
@@ -155,10 +156,10 @@ class AbstractEffect(eqx.Module):
     Array fields are its parameters, but for `known` ones.
     """
 
-    name: ClassVar[str]
-    """Key of the catalogue, and of the vocabulary if `reported_as` does not name another."""
+    name: ClassVar[str] = ""
+    """Key of the catalogue: the name of the class in words, unless it is given."""
     reported_as: ClassVar[str] = ""
-    """Key of the vocabulary for a law that it has no name for."""
+    """Key of the vocabulary where that is another: for a law that it has no name for."""
     named: ClassVar[bool] = True
     """False for a law without a form of its own."""
     meaning: ClassVar[str] = ""
@@ -188,6 +189,9 @@ class AbstractEffect(eqx.Module):
     """The joint that it acts on, counted from 1; None: all, or no joint."""
     channel: str | None = eqx.field(static=True, default=None, kw_only=True)
     """The reading that it acts on ("all": every one); of equations also the port, or the input."""
+
+    def __init_subclass__(cls):
+        cls.name = vars(cls).get("name", re.sub(r"\B(?=[A-Z])", "_", cls.__name__).lower())
 
     @classmethod
     def key(cls) -> str:
@@ -360,14 +364,6 @@ def pair(make: Callable[..., AbstractEffect], probe: float, spread: float, *inne
     at, wide = [value for value, _ in inner], [std for _, std in inner]
     probes = make(probe, 0.0, *at), make(0.0, probe, *at)
     return Candidate(make(0.0, 0.0, *at), probes, make(spread, spread, *wide))
-
-
-def contact(deep: Scalar, rate: Scalar, stiffness: Scalar, damping: Scalar, edge: float) -> Scalar:
-    """Force of a spring and a damper that are pressed in, on either side, and never pull. The damper comes on within
-    `edge`, so that a fit can move the place of contact.
-    """
-    push = stiffness * deep + damping * jnp.tanh(jnp.abs(deep) / edge) * rate
-    return jnp.where(deep > 0, jnp.maximum(push, 0.0), jnp.minimum(push, 0.0))
 
 
 def a(value: Any) -> Any:

@@ -40,7 +40,6 @@ class Payload(Variation):
     In place of the centre c its first moment mass (c - point) about a known point is fitted: forces are linear in it.
     """
 
-    name: ClassVar[str] = "payload"
     meaning: ClassVar[str] = "A body carries more mass than declared."
     confirm: ClassVar[str] = "Weigh the links, with everything that is mounted on them."
     units: ClassVar[dict[str, str]] = {"mass": "kg", "centre_x": "m", "centre_y": "m", "centre_z": "m"}
@@ -80,7 +79,6 @@ def _anywhere(kind: type[Payload], joint: int, spot) -> Candidate:
 class LinkInertia(Variation):
     """A moment of inertia off by dI."""
 
-    name: ClassVar[str] = "link_inertia"
     meaning: ClassVar[str] = "A link is harder (or easier) to spin than declared."
     confirm: ClassVar[str] = "Swing the link alone about a known axis and time it."
     units: ClassVar[dict[str, str]] = {"dI": "kg m^2"}
@@ -90,7 +88,6 @@ class LinkInertia(Variation):
 class LinkLength(Variation):
     """A length off by dl."""
 
-    name: ClassVar[str] = "link_length"
     meaning: ClassVar[str] = "A link is longer (or shorter) than declared."
     confirm: ClassVar[str] = "Measure the distance between the joints."
     units: ClassVar[dict[str, str]] = {"dl": "m"}
@@ -100,7 +97,6 @@ class LinkLength(Variation):
 class CenterOfMass(Variation):
     """A centre of mass off by dlc along the link."""
 
-    name: ClassVar[str] = "center_of_mass"
     meaning: ClassVar[str] = "The centre of mass of a link is not where declared."
     confirm: ClassVar[str] = "Balance the link on an edge."
     units: ClassVar[dict[str, str]] = {"dlc": "m"}
@@ -110,7 +106,6 @@ class CenterOfMass(Variation):
 class PayloadStep(JointEffect):
     """A payload that comes on at a moment of the clock; the edge is some samples wide, so that a fit can move it."""
 
-    name: ClassVar[str] = "payload_step"
     meaning: ClassVar[str] = "The payload changed at a moment of the session."
     confirm: ClassVar[str] = "Ask what was mounted or lost at that moment."
     units: ClassVar[dict[str, str]] = {"mass": "kg", "time": "s"}

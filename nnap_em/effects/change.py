@@ -18,7 +18,6 @@ PROBED, PRIOR_STD = 0.05, 0.5
 class CoulombChange(JointEffect):
     """Coulomb friction of a joint differs from that of the fit: -change sign(w)."""
 
-    name: ClassVar[str] = "coulomb_change"
     meaning: ClassVar[str] = "Coulomb friction is not what it was when the machine was fitted."
     confirm: ClassVar[str] = "Turn the joint slowly both ways and log the torques that it takes."
     units: ClassVar[dict[str, str]] = {"change": "N m"}
@@ -31,9 +30,8 @@ class CoulombChange(JointEffect):
     def candidates(cls, around):
         learned = around.joints if around.moved is not None and around.learned else ()
         # Rate over which Coulomb friction changes its sign, in the largest rate of the joint: as `Weights` has it
-        knees = [partial(cls, knee=a(0.01 * float(around.speed[j - 1])), joint=j) for j in learned]
-        sizes = zip(knees, map(float, around.torque), strict=False)
-        return [one(make, 0.0, PROBED * torque, PRIOR_STD * torque) for make, torque in sizes]
+        sizes = [(j, 0.01 * float(around.speed[j - 1]), float(around.torque[j - 1])) for j in learned]
+        return [one(partial(cls, knee=a(k), joint=j), 0.0, PROBED * n, PRIOR_STD * n) for j, k, n in sizes]
 
     def phrase(self, sizes):
         return f"the Coulomb friction of joint {self.joint} by {sizes['change']}"
@@ -45,7 +43,6 @@ class CoulombChange(JointEffect):
 class ViscousChange(JointEffect):
     """Viscous friction of a joint differs from that of the fit: -change w."""
 
-    name: ClassVar[str] = "viscous_change"
     meaning: ClassVar[str] = "Viscous friction is not what it was when the machine was fitted."
     confirm: ClassVar[str] = "Turn the joint at two speeds and log the torques that it takes."
     units: ClassVar[dict[str, str]] = {"change": "N m s/rad"}

@@ -34,7 +34,6 @@ class Flow(AbstractEffect):
     signals p and q that `first` and `second` pick of states and inputs.
     """
 
-    name: ClassVar[str] = "flow"
     meaning: ClassVar[str] = "A flow."
     confirm: ClassVar[str] = "Change one signal of it at a time."
     strength: Scalar
@@ -61,7 +60,23 @@ def _one_of(names: Sequence[str], name: str | None) -> Float[Array, " name"]:
     return a([float(other == name) for other in names])
 
 
-class PortEffect(AbstractEffect):
+class SignalEffect(AbstractEffect):
+    """A law of some signals of equations, whose `lean` form is one formula for all."""
+
+    reads: tuple[str, ...] = eqx.field(static=True, kw_only=True)
+    """Names of its signals."""
+
+    def force(self, scene, memory):
+        return self.lean(scene.system).force(scene, memory)
+
+    def inputs_named(self):
+        return self.reads
+
+    def signals(self, system):
+        return self.reads
+
+
+class PortEffect(SignalEffect):
     """A law of some signals at a port, or from one to another."""
 
     kind: ClassVar[int]
@@ -73,8 +88,6 @@ class PortEffect(AbstractEffect):
     count: ClassVar[int] = 1
     """Number of its signals, where they may be any."""
 
-    reads: tuple[str, ...] = eqx.field(static=True, kw_only=True)
-    """Names of its signals."""
     to: str | None = eqx.field(static=True, default=None, kw_only=True)
     """Port that a share of it enters."""
     strength: Scalar = eqx.field(kw_only=True, converter=a)
@@ -88,9 +101,6 @@ class PortEffect(AbstractEffect):
         source, target = way * _one_of(ports, self.channel), -way * _one_of(ports, self.to)
         kind = np.eye(len(FORMS))[self.kind]
         return Flow(self.strength, self.level, self.share, kind, first, second, source, target, self.edge)
-
-    def force(self, scene, memory):
-        return self.lean(scene.system).force(scene, memory)
 
     def with_numbers(self, lean):
         numbers = lambda e: (e.strength, e.level, e.share)  # noqa: E731
@@ -119,9 +129,6 @@ class PortEffect(AbstractEffect):
 
     def inputs_named(self):
         return (*self.reads, *([self.to] if self.to else []))
-
-    def signals(self, system):
-        return self.reads
 
     def is_physical(self) -> bool:
         """A flow that leaves a state has a positive strength, and no more of it arrives than leaves, but for errors."""
@@ -169,7 +176,6 @@ class PortEffect(AbstractEffect):
 class ConstantFlow(PortEffect):
     """strength."""
 
-    name: ClassVar[str] = "constant_flow"
     meaning: ClassVar[str] = "A state gains or loses at a constant rate."
     confirm: ClassVar[str] = "Leave all inputs at zero and watch the state drift."
     kind: ClassVar[int] = 0
@@ -179,7 +185,6 @@ class ConstantFlow(PortEffect):
 class LinearFlow(PortEffect):
     """strength p: a leak where p is the state itself, else a coupling."""
 
-    name: ClassVar[str] = "linear_flow"
     meaning: ClassVar[str] = "A state gains or loses in proportion to a signal: a leak where it is its own."
     confirm: ClassVar[str] = "Hold all else still, change this signal alone, and watch the rate of the state."
     kind: ClassVar[int] = 1
@@ -188,7 +193,6 @@ class LinearFlow(PortEffect):
 class SquareFlow(PortEffect):
     """strength p |p|."""
 
-    name: ClassVar[str] = "square_flow"
     meaning: ClassVar[str] = "A state gains or loses with the square of a signal."
     confirm: ClassVar[str] = "Hold all else still, double this signal, and compare the rates of the state."
     kind: ClassVar[int] = 4
@@ -197,7 +201,6 @@ class SquareFlow(PortEffect):
 class ProductFlow(PortEffect):
     """strength p q."""
 
-    name: ClassVar[str] = "product_flow"
     meaning: ClassVar[str] = "A state gains or loses in proportion to the product of two signals."
     confirm: ClassVar[str] = "Change one of the two signals while the other is zero: the rate must stay."
     kind: ClassVar[int] = 3
@@ -207,7 +210,6 @@ class ProductFlow(PortEffect):
 class ThresholdFlow(PortEffect):
     """strength (p - level) where p is above the level."""
 
-    name: ClassVar[str] = "threshold_flow"
     meaning: ClassVar[str] = "A state gains or loses once a signal is above a level."
     confirm: ClassVar[str] = "Raise this signal slowly and watch where the rate of the state begins to change."
     kind: ClassVar[int] = 5
@@ -217,7 +219,6 @@ class ThresholdFlow(PortEffect):
 class Exchange(PortEffect):
     """strength (p - q) leaves the state p and enters the state q, as heat and pressure do."""
 
-    name: ClassVar[str] = "exchange"
     meaning: ClassVar[str] = "One state loses to another in proportion to their difference, as heat does."
     confirm: ClassVar[str] = "Bring one of the two states up with all inputs off, and watch the other follow."
     kind: ClassVar[int] = 2
@@ -231,7 +232,6 @@ class Exchange(PortEffect):
 class Transfer(PortEffect):
     """strength (p - level) leaves the state p above a level, and a share of it enters another."""
 
-    name: ClassVar[str] = "transfer"
     meaning: ClassVar[str] = "Above a level one state loses, and another gains a share of it."
     confirm: ClassVar[str] = "Fill the first state above the level and watch where the flow goes."
     kind: ClassVar[int] = 5
@@ -246,7 +246,6 @@ class Transfer(PortEffect):
 class Overflow(PortEffect):
     """strength u leaves the state p while it is above a level, and a share of it enters another."""
 
-    name: ClassVar[str] = "overflow"
     meaning: ClassVar[str] = "Above a level of a state its inflow goes elsewhere, a share of it into another state."
     confirm: ClassVar[str] = "Fill the first state above the level and watch where the inflow goes."
     kind: ClassVar[int] = 6
@@ -307,7 +306,6 @@ def _function_jvp(at, moved):
 class FreeFlow(AbstractEffect):
     """A free function of the signals that `pick` takes of states and inputs, at the port `at`; one program for all."""
 
-    name: ClassVar[str] = "free_flow"
     meaning: ClassVar[str] = "A flow as a function of some signals."
     named: ClassVar[bool] = False
     confirm: ClassVar[str] = "Change one signal of it at a time."
@@ -323,14 +321,13 @@ class FreeFlow(AbstractEffect):
         return _function(self.weights @ self.basis, values, self.low, self.high) * self.at
 
 
-class UnknownTerm(AbstractEffect):
+class UnknownTerm(SignalEffect):
     """sum_i w_i phi_i(signals) at a port, of Gaussian basis functions on a grid, free of the span of the parameters.
 
     phi = T psi, psi on the grid: T takes out of it what a change of the parameters does to the rate of the port along
     the logs, so that the two do not compete.
     """
 
-    name: ClassVar[str] = "unknown_term"
     meaning: ClassVar[str] = "A rate as a function of these signals, outside the vocabulary of effects."
     named: ClassVar[bool] = False
     confirm: ClassVar[str] = "Hold all signals but one still, and move that one through its range."
@@ -339,8 +336,6 @@ class UnknownTerm(AbstractEffect):
     """T."""
     low: Any = known()
     high: Any = known()
-    reads: tuple[str, ...] = eqx.field(static=True, kw_only=True)
-    """Names of its signals."""
     label: str = eqx.field(static=True, default="", kw_only=True)
     """Name in rig.toml; empty for one that a search proposes."""
 
@@ -356,9 +351,6 @@ class UnknownTerm(AbstractEffect):
         rows = np.asarray(jax.vmap(self.grid)(jnp.asarray(places))) @ np.asarray(self.basis).T
         return places, rows @ np.asarray(self.weights), np.sqrt(np.einsum("pi,ij,pj->p", rows, cov, rows))
 
-    def force(self, scene, memory):
-        return self.lean(scene.system).force(scene, memory)
-
     def lean(self, system):
         nodes, numbers = self.basis.shape[1], self.weights.shape[0]
         signals, fill = (*system.states, *system.inputs), [(0, nodes - numbers)]
@@ -370,14 +362,5 @@ class UnknownTerm(AbstractEffect):
         weights = cast(FreeFlow, lean).weights[: self.weights.shape[0]]
         return eqx.tree_at(lambda e: e.weights, self, weights)
 
-    def values(self):
-        return {}
-
     def phrase(self, sizes):
         return f"a flow into {self.channel} that depends on {' and '.join(self.reads)}"
-
-    def inputs_named(self):
-        return self.reads
-
-    def signals(self, system):
-        return self.reads

@@ -16,7 +16,6 @@ from .base import AbstractEffect, Candidate, JointEffect, Scalar, a, fields, inp
 class PositionDependentFriction(JointEffect):
     """tau_f (1 + depth cos(n theta_j + phase))."""
 
-    name: ClassVar[str] = "position_dependent_friction"
     meaning: ClassVar[str] = "Friction is stronger at some angles than at others."
     confirm: ClassVar[str] = "Turn the joint slowly through its range and log the torque that it takes."
     units: ClassVar[dict[str, str]] = {"depth": "-", "n": "-", "phase": "rad"}
@@ -44,7 +43,6 @@ class PositionDependentFriction(JointEffect):
 class FrictionDrift(JointEffect):
     """tau_f (1 + change (1 - exp(-t / tau)))."""
 
-    name: ClassVar[str] = "friction_drift"
     meaning: ClassVar[str] = "Friction changes with time, as by warming up."
     confirm: ClassVar[str] = "Run the same motion cold and warm."
     units: ClassVar[dict[str, str]] = {"change": "-", "tau": "s"}
@@ -83,7 +81,6 @@ class LoadFriction(JointEffect):
     learned friction holds them.  The exponent 2 of the Stribeck part is fixed; they fit it.
     """
 
-    name: ClassVar[str] = "load_friction"
     reported_as: ClassVar[str] = "unknown_function"
     confirm: ClassVar[str] = "Lift and lower a weight slowly: the torques differ by twice the friction, at each weight."
     units: ClassVar[dict[str, str]] = {
@@ -139,18 +136,13 @@ class LoadFriction(JointEffect):
         return split if self.stribeck is None else replace(split, load_stribeck=share * self.stribeck)
 
     def values(self):
-        mu, load, stribeck, load_stribeck = self._shares()
-        numbers = {"mu": mu, "mu_load": load, "mu_stribeck": stribeck, "mu_load_stribeck": load_stribeck}
+        whole = lambda motor, load: motor if load is None and self.whole else load  # noqa: E731
+        numbers = {"mu": self.mu, "mu_load": whole(self.mu, self.load), "mu_stribeck": self.stribeck}
+        numbers["mu_load_stribeck"] = whole(self.stribeck, self.load_stribeck)
         if self.log_velocity is not None:
             numbers["stribeck_velocity"] = jnp.exp(self.log_velocity)
         numbers |= {"square_motor": self.square_motor, "square_load": self.square_load}
         return {name: value for name, value in numbers.items() if value is not None}
-
-    def _shares(self) -> tuple[Scalar | None, ...]:
-        """Coefficients of motor and load, steady and at rest; None: no such number."""
-        whole = lambda motor, load: motor if load is None and self.whole else load  # noqa: E731
-        mu, stribeck = self.mu, self.stribeck
-        return mu, whole(mu, self.load), stribeck, whole(stribeck, self.load_stribeck)
 
     def is_physical(self):
         return float(self.mu) + (0.0 if self.load is None else float(self.load)) > 0
@@ -201,7 +193,6 @@ def _grown(old: LoadFriction, start: LoadFriction, size: float = 1.0) -> Candida
 class AirDrag(AbstractEffect):
     """-c |w| w at a joint, or the drag of a point at the tip (joint None)."""
 
-    name: ClassVar[str] = "air_drag"
     meaning: ClassVar[str] = "A brake that grows with the square of speed, as air does."
     confirm: ClassVar[str] = "Swing once with the tip shrouded, or once slow and once fast."
     units: ClassVar[dict[str, str]] = {"c": "N m s^2/rad^2"}
@@ -252,7 +243,6 @@ class PreslidingFriction(JointEffect):
     [Canudas de Wit, Olsson, Astrom & Lischinsky 1995, eqs. 1 to 3, written in the bristle's torque s]
     """
 
-    name: ClassVar[str] = "presliding_friction"
     meaning: ClassVar[str] = "Friction with memory: before it slides, the joint gives like a spring."
     confirm: ClassVar[str] = "Push the joint at rest with a small torque and see whether it springs back."
     units: ClassVar[dict[str, str]] = {"sigma0": "N m/rad"}

@@ -98,7 +98,6 @@ class InputAxis(AbstractAxis):
 class UnknownFunction(JointEffect):
     """A torque sum_i w_i phi_i(inputs) at one joint [Broomhead & Lowe 1988]."""
 
-    name: ClassVar[str] = "unknown_function"
     meaning: ClassVar[str] = "A force as a function of these signals, outside the vocabulary of effects."
     named: ClassVar[bool] = False
     confirm: ClassVar[str] = "Repeat the motion with what stands under suspicion taken off."
@@ -124,9 +123,6 @@ class UnknownFunction(JointEffect):
         friction = [_function(j, (axes[rate,](20),), around) for j, rate in rates if (rate,) in axes]
         fits = lambda axis, j: axis.acts(system) in (None, j) and axis.of_states(system) <= near[j]  # noqa: E731
         return friction + [_function(j, grid, around) for j, grid in places if all(fits(axis, j) for axis in grid)]
-
-    def values(self):
-        return {}
 
     def inputs_named(self):
         return tuple(dict.fromkeys(name for axis in self.axes for name in axis.names))
@@ -217,7 +213,6 @@ OVERTONES = 7
 class PeriodicForce(JointEffect):
     """sum_h s_h sin(2 pi h f t) + c_h cos(2 pi h f t): its period is found first, then its waveform."""
 
-    name: ClassVar[str] = "periodic_force"
     reported_as: ClassVar[str] = "unknown_function"
     confirm: ClassVar[str] = "Log the motion at rest with the drives off: what beside the machine pushes in time?"
     units: ClassVar[dict[str, str]] = {"size": "N m", "frequency": "Hz"}

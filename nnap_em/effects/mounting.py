@@ -12,7 +12,6 @@ from .base import AbstractEffect, Scalar, a, known, one, pair
 class BaseTilt(AbstractEffect):
     """Gravity acts on theta1 + angle."""
 
-    name: ClassVar[str] = "base_tilt"
     meaning: ClassVar[str] = "The base is not level: gravity points in another direction than declared."
     confirm: ClassVar[str] = "Put a level on the base, and let the machine hang at rest: where does it read zero?"
     units: ClassVar[dict[str, str]] = {"angle": "rad"}
@@ -45,7 +44,6 @@ class BaseTilt(AbstractEffect):
 class BaseVibration(AbstractEffect):
     """Horizontal base acceleration amplitude sin(2 pi frequency t + phase)."""
 
-    name: ClassVar[str] = "base_vibration"
     meaning: ClassVar[str] = "The base shakes, or something else forces the machine periodically."
     confirm: ClassVar[str] = "Put an accelerometer on the base."
     units: ClassVar[dict[str, str]] = {"amplitude": "m/s^2", "frequency": "Hz", "phase": "rad"}

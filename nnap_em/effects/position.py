@@ -17,7 +17,6 @@ class TorsionalSpring(JointEffect):
     Inside a cubic in the angle, which is linear in what is estimated: k is its slope where it pulls to neither side.
     """
 
-    name: ClassVar[str] = "torsional_spring"
     meaning: ClassVar[str] = "A joint is pulled back to a rest position, as by a cable or a spring."
     confirm: ClassVar[str] = "Move the unpowered joint by hand: does a cable, hose or spring pull back to one angle?"
     units: ClassVar[dict[str, str]] = {"k": "N m/rad", "theta0": "rad"}
@@ -71,7 +70,6 @@ class TorsionalSpring(JointEffect):
 class Cogging(JointEffect):
     """amplitude sin(k theta_j + phase), and an overtone of twice k: detents are seldom pure."""
 
-    name: ClassVar[str] = "cogging"
     meaning: ClassVar[str] = "A torque that repeats with the angle, as from magnets or gear teeth."
     confirm: ClassVar[str] = "Turn the joint slowly by hand and count the detents of a turn."
     units: ClassVar[dict[str, str]] = {"amplitude": "N m", "k": "-", "phase": "rad"}
@@ -117,7 +115,6 @@ class Cogging(JointEffect):
 class TorqueOffset(JointEffect):
     """A constant torque; a learned friction map holds it."""
 
-    name: ClassVar[str] = "torque_offset"
     meaning: ClassVar[str] = "A constant torque at a joint."
     confirm: ClassVar[str] = "Let the unpowered joint settle from both sides and compare."
     units: ClassVar[dict[str, str]] = {"value": "N m"}
@@ -136,7 +133,6 @@ class TorqueOffset(JointEffect):
 class HardStop(JointEffect):
     """Contact with stops, as a spring and a damper of a stiffness that the sampling can follow."""
 
-    name: ClassVar[str] = "hard_stop"
     meaning: ClassVar[str] = "A joint meets a stop."
     confirm: ClassVar[str] = "Move the joint slowly to its ends and note the angles."
     units: ClassVar[dict[str, str]] = {"upper": "rad", "lower": "rad"}
@@ -184,7 +180,6 @@ class HardStop(JointEffect):
 class EddyBrake(JointEffect):
     """-c cos^2(theta_j - center) w_j."""
 
-    name: ClassVar[str] = "eddy_brake"
     meaning: ClassVar[str] = "A brake that works at some angles, as by a magnet."
     confirm: ClassVar[str] = "Let the joint coast through a turn at one speed and look where it slows."
     units: ClassVar[dict[str, str]] = {"c": "N m s/rad", "center": "rad"}

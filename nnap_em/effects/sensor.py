@@ -13,7 +13,6 @@ from .mounting import BaseTilt
 class SensorBias(SensorEffect):
     """value + bias."""
 
-    name: ClassVar[str] = "sensor_bias"
     meaning: ClassVar[str] = "A sensor is off by a constant."
     confirm: ClassVar[str] = "Bring what it reads, as a joint, to a known value and read the sensor."
     units: ClassVar[dict[str, str]] = {"bias": "unit of the channel"}
@@ -36,7 +35,6 @@ class SensorBias(SensorEffect):
 class SensorScale(SensorEffect):
     """scale value."""
 
-    name: ClassVar[str] = "sensor_scale"
     meaning: ClassVar[str] = "A sensor reads too large or too small, in a fixed proportion."
     confirm: ClassVar[str] = "Change what it reads, as an angle, by a known amount and compare."
     units: ClassVar[dict[str, str]] = {"scale": "-"}
@@ -58,7 +56,6 @@ class SensorScale(SensorEffect):
 class SensorDelay(SensorEffect):
     """The value some time ago."""
 
-    name: ClassVar[str] = "sensor_delay"
     meaning: ClassVar[str] = "A sensor reports late."
     confirm: ClassVar[str] = "Tap the link, or make a step, and compare the sensor with a second one on the same clock."
     units: ClassVar[dict[str, str]] = {"delay": "s"}
@@ -80,7 +77,6 @@ class SensorQuantization(SensorEffect):
     The score test cannot see it; `grid_step` reads it off the numbers themselves.
     """
 
-    name: ClassVar[str] = "sensor_quantization"
     meaning: ClassVar[str] = "A sensor reads in steps."
     confirm: ClassVar[str] = "Look up the counts per turn of the encoder."
     units: ClassVar[dict[str, str]] = {"step": "unit of the channel"}

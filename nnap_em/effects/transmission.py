@@ -7,7 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from .base import Candidate, JointEffect, Scalar, contact
+from .base import Candidate, JointEffect, Scalar
 
 
 class Transmission(JointEffect):
@@ -45,7 +45,6 @@ MOTOR = 0.05
 class JointFlexibility(Transmission):
     """An elastic transmission of stiffness k."""
 
-    name: ClassVar[str] = "joint_flexibility"
     meaning: ClassVar[str] = "The transmission between motor and joint gives elastically."
     confirm: ClassVar[str] = "Block the link and twist the motor: the angle per torque."
     units: ClassVar[dict[str, str]] = {"k": "N m/rad"}
@@ -76,7 +75,6 @@ class JointFlexibility(Transmission):
 class Backlash(Transmission):
     """Play of width gap, with a stiff contact at either side."""
 
-    name: ClassVar[str] = "backlash"
     meaning: ClassVar[str] = "Play between motor and joint."
     confirm: ClassVar[str] = "Block the motor and wiggle the link."
     units: ClassVar[dict[str, str]] = {"gap": "rad"}
@@ -101,4 +99,7 @@ class Backlash(Transmission):
 
     def torque(self, twist, rate):
         half = 0.5 * jnp.maximum(self.gap, 0.0)
-        return contact(twist - jnp.clip(twist, -half, half), rate, jnp.exp(self.log_k), jnp.exp(self.log_damping), 1e-3)
+        deep = twist - jnp.clip(twist, -half, half)
+        # the damper comes on within 0.001 rad, so that a fit can move the gap; a contact never pulls
+        push = jnp.exp(self.log_k) * deep + jnp.exp(self.log_damping) * jnp.tanh(jnp.abs(deep) / 1e-3) * rate
+        return jnp.where(deep > 0, jnp.maximum(push, 0.0), jnp.minimum(push, 0.0))

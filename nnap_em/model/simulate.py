@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from ..data.dataset import Dataset
 from ..data.rig import Declared, Rig
 from ..numerics.gaussian import Gaussian
-from ..systems import pendubot, specs
+from ..systems import specs
 from ..systems.acrobot import Acrobot, drives, table_i
 from ..systems.base import AbstractSystem
 from ..systems.pendulum import Pendulum
@@ -81,12 +81,10 @@ def paper_friction(dtype=float) -> StribeckLaw:
     return StribeckLaw(a(0.030, 0.017), a(0.045, 0.027), a(0.35, 0.40), a(0.0070, 0.0035), a(0.1, 0.1))
 
 
-def paper_model(*, q_std=(2e-4, 1e-2), r_std=(0.01, 0.05), start_std: float = 0.5, dtype=float) -> StateSpaceModel:
+def paper_model(*, start_std: float = 0.5, dtype=float) -> StateSpaceModel:
     """The true acrobot of the paper: Table I, friction in both joints, only joint 1 read at 100 Hz.
 
     Args:
-        q_std: process noise of angles [rad] and rates [rad/s] per step.
-        r_std: noise of the readings of theta1 [rad] and its rate [rad/s].
         start_std: standard deviation of theta2 in the first row [rad].
         dtype: of all numbers.
 
@@ -104,8 +102,8 @@ def paper_model(*, q_std=(2e-4, 1e-2), r_std=(0.01, 0.05), start_std: float = 0.
         system=system,
         unknown=paper_friction(dtype),
         start=Gaussian(jnp.asarray([jnp.pi, 0.0, 0.0, 0.0], dtype), cov),
-        log_q=2 * jnp.log(a(q_std[0], q_std[0], q_std[1], q_std[1])),
-        log_r=2 * jnp.log(a(*r_std)),
+        log_q=2 * jnp.log(a(2e-4, 2e-4, 1e-2, 1e-2)),
+        log_r=2 * jnp.log(a(0.01, 0.05)),
         measured=(0, 2),
         dt=0.01,
     )
@@ -219,7 +217,7 @@ class Example(NamedTuple):
 
 def _pendubot() -> Example:
     model = paper_model()
-    system = dataclasses.replace(model.system, joints=pendubot.drives)
+    system = dataclasses.replace(model.system, joints=(1,))
     return Example(dataclasses.replace(model, system=system), paper_sweep._replace(amplitude=(0.2, 1.0)))
 
 

@@ -9,7 +9,7 @@ from typing import Any
 from ..data import rig as rigs
 from ..data.rig import Rig, SystemSpec
 from ..machines.from_file import declare
-from . import acrobot, declared, equations, pendubot, pendulum, slide, tree
+from . import acrobot, declared, equations, pendulum, slide, tree
 from .base import AbstractSystem
 from .equations import Equations
 from .expression import root
@@ -17,7 +17,7 @@ from .plant import AbstractPlant
 
 systems: dict[str, Any] = {
     "acrobot": acrobot.Acrobot,
-    "pendubot": pendubot.Pendubot,
+    "pendubot": acrobot.Acrobot,
     "pendulum": pendulum.Pendulum,
     "slide": slide.Slide,
 }

@@ -1,4 +1,4 @@
-"""The acrobot: a two-link arm whose second joint is driven."""
+"""The acrobot: a two-link arm whose second joint is driven; of the pendubot it is the first."""
 
 from .arm import TwoLinkArm
 

@@ -10,8 +10,7 @@ from jaxtyping import Array, Float
 
 from ..numerics.elementary import cos, sin
 from .base import AbstractSystem
-
-Scalar = Float[Array, ""]
+from .plant import Scalar
 
 
 def _payload(arm: "TwoLinkArm", mass: Scalar) -> "TwoLinkArm":

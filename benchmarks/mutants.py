@@ -386,8 +386,8 @@ finish takes no shorter steps
 + for share in (1.0,):
 ## test_fit.py::test_a_shaped_finish_adds_the_prior_of_friction_and_nothing_to_parameters
 shape of friction pushed away from
-- score.at[nodes].add(-pull[nodes])
-+ score.at[nodes].add(pull[nodes])
+- score[nodes] -= pull[nodes]
++ score[nodes] += pull[nodes]
 ## test_stated.py::test_forces_unsaid_move_states_as_the_same_input_does
 forces unsaid that move no state
 - [torque, linear.by_parameter, moved], axis=-1)

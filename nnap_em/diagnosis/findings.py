@@ -6,11 +6,11 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
-from ..effects import AbstractEffect, catalogue, fields, flat
+from ..effects import AbstractEffect, catalogue, fields
 from ..effects.base import Curve
 from ..numerics.digits import finite, number, share_of, with_std
 from .hypothesis import covariances
@@ -39,16 +39,14 @@ def estimates(effect: AbstractEffect, cov: Float[np.ndarray, "param param"], sys
 @eqx.filter_jit
 def _reported(effect: AbstractEffect):
     """The reported parameters, and how they move with the effect's own numbers."""
-    reported = lambda numbers: filled(effect, numbers).values()  # noqa: E731
-    return reported(flat(effect)), jax.jacfwd(reported)(flat(effect))
+    names = fields(effect)
+    numbers, unravel = ravel_pytree([getattr(effect, name) for name in names])
 
+    def reported(numbers: Float[Array, " param"]) -> dict[str, Array]:
+        changed = eqx.tree_at(lambda e: [getattr(e, name) for name in names], effect, unravel(numbers))
+        return changed.values()
 
-def filled(effect: AbstractEffect, numbers: Float[Array, " param"]) -> AbstractEffect:
-    """The effect with other parameters."""
-    old = [getattr(effect, name) for name in fields(effect)]
-    parts = jnp.split(numbers, np.cumsum([np.size(part) for part in old])[:-1])
-    new = [part.reshape(jnp.shape(was)) for part, was in zip(parts, old, strict=True)]
-    return eqx.tree_at(lambda e: [getattr(e, name) for name in fields(effect)], effect, new)
+    return reported(numbers), jax.jacfwd(reported)(numbers)
 
 
 class Finding(NamedTuple):
@@ -133,12 +131,12 @@ def verdict(
     if not accepted:
         return "Nothing is missing that these data could show: the declared model explains them."
     names, it = listed([_sized(finding) for finding in accepted]), "it" if len(accepted) == 1 else "them"
-    text, grows = f"{opening} {names}", growth(error) if error else {}
+    text, grows = f"{opening} {names}", growth(error or {})
     if not error or not grows:
         return text + "."
-    judged = error.get("judged_s", 1.0)
-    at, horizon = error["horizons_s"].index(judged), f"{min(judged, error.get('reach_s', judged)):.3g} s"
-    ratios = [(c, error["before"][c][at], error["after"][c][at]) for c in sorted(grows, key=grows.__getitem__)]
+    judged, pairs = _judged(error)
+    horizon = f"{min(judged, error.get('reach_s', judged)):.3g} s"
+    ratios = [(column, *pairs[column]) for column in sorted(grows, key=grows.__getitem__)]
     if sum(grows.values()) >= 0:
         column, before, after = ratios[-1]
         stays = f"the {horizon} prediction error of {column} does not fall with {it}"
@@ -174,13 +172,17 @@ def changes(diagnosis: Diagnosis, accepted: Sequence[Finding], error: Mapping[st
 
 def growth(error: Mapping[str, Any]) -> dict[str, float]:
     """Log of the test error 1 s ahead with the accepted effects over that without, by column; known ones alone."""
+    return {column: math.log(max(a, 1e-300) / max(b, 1e-300)) for column, (b, a) in _judged(error)[1].items()}
+
+
+def _judged(error: Mapping[str, Any]) -> tuple[float, dict[str, tuple[float, float]]]:
+    """Horizon [s] and, by column, test errors there without and with the accepted effects, where both are known."""
     judged = error.get("judged_s", 1.0)
     if judged not in (error.get("horizons_s") or []):
-        return {}
+        return judged, {}
     at, before, after = error["horizons_s"].index(judged), error["before"], error["after"]
     pairs = {column: (before[column][at], after[column][at]) for column in before if column in after}
-    known = {column: pair for column, pair in pairs.items() if all(map(finite, pair))}
-    return {column: math.log(max(a, 1e-300) / max(b, 1e-300)) for column, (b, a) in known.items()}
+    return judged, {column: pair for column, pair in pairs.items() if all(map(finite, pair))}
 
 
 def _texts(parameters: Mapping[str, Estimate]) -> dict[str, str]:

@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.ndimage import convolve1d
 from scipy.spatial import KDTree
 
 from ..data.dataset import Dataset
@@ -26,9 +27,8 @@ LEVEL, ALONE = 4.0, 2.0
 state that has no neighbours."""
 SMALL = 0.05
 """Smallest disturbance, as a share of the typical torque of its joint."""
-NEIGHBOUR_DISTANCE, NEIGHBOURS, VIEW, OTHERS = 1.2, 5, 0.5, 10
-"""Largest distance of a neighbour in state space, in radians or in rms of rates and inputs, and number of neighbours;
-both for a comparison by the signals of one joint alone."""
+NEIGHBOUR_DISTANCE, NEIGHBOURS = 1.2, 5
+"""Largest distance of a neighbour in state space [rad, or rms of rates and inputs], and number of neighbours."""
 REPEATED = 0.5
 """Share of a force from which on, as the mean of its neighbours, it is a law of the machine."""
 
@@ -56,11 +56,11 @@ def averaged(a: Float[np.ndarray, "seq time column"], rows: int) -> Float[np.nda
     """Means over Hann windows of `rows` rows; NaN where one does not fit."""
     if not a.size:
         return a
-    kernel = np.hanning(rows + 2)[1:-1]
-    kernel = kernel / kernel.sum()
-    over = lambda a: np.apply_along_axis(lambda row: np.convolve(row, kernel, "same"), 1, a)  # noqa: E731
-    known = np.isfinite(a)
-    return np.where(over(known.astype(float)) > 0.99, over(np.where(known, a, 0.0)), np.nan)
+    kernel, known = np.hanning(rows + 2)[1:-1], np.isfinite(a)
+    weights, middle = kernel / kernel.sum(), -(rows % 2 == 0)
+    parts = known.astype(float), np.where(known, a, 0.0)
+    share, total = (convolve1d(part, weights, axis=1, mode="constant", origin=middle) for part in parts)
+    return np.where(share > 0.99, total, np.nan)
 
 
 def level(a: Float[np.ndarray, "seq window"]) -> Float[np.ndarray, "seq 1"]:
@@ -96,62 +96,40 @@ class Places(NamedTuple):
     row: Int[np.ndarray, " place"]
     state: Float[np.ndarray, "place feature"]
     """All that a law may depend on, in units in which a distance of `NEIGHBOUR_DISTANCE` is small."""
-    subspaces: tuple[Float[np.ndarray, "place feature"], ...]
-    """All that a law of one joint may depend on: its angle and rate; the input and rate."""
 
 
 def places(residual: Residual, names: Names, dt: float) -> Places:
     """One place every `WINDOW_DISTANCE` of all sequences, where the state is known."""
     dof = len(names.coordinates)
     q, v, u = residual.state[..., :dof], residual.state[..., dof:], averaged(residual.u, max(3, round(WINDOWS[0] / dt)))
-    seq, row = np.nonzero(np.isfinite(np.concatenate([q, v, u], axis=-1)).all(-1) & residual.valid)
-    keep = row % max(1, round(WINDOW_DISTANCE / dt)) == 0
-    seq, row = seq[keep], row[keep]
-
-    def scaled(a):
-        a = a[seq, row]
-        return a / (np.sqrt(np.mean(a**2, axis=0)) + 1e-300)
-
-    v, u = scaled(v), scaled(u)
-    angle = [np.stack([np.sin(x), np.cos(x)], axis=1) for x in q[seq, row].T]
-    for j in np.flatnonzero(~np.array(names.rotary, bool)):
-        angle[j] = scaled(q[..., j : j + 1] - np.mean(q[seq, row, j]))
-    subspaces = [np.concatenate([angle[j], v[:, j : j + 1]], axis=1) for j in range(dof)]
-    subspaces += [np.stack([u[:, i], v[:, joint - 1]], axis=1) for i, joint in enumerate(names.joints)]
-    return Places(seq, row, np.concatenate([*angle, v, u], axis=1), tuple(subspaces))
+    known = residual.valid & np.isfinite(np.concatenate([q, v, u], axis=-1)).all(-1)
+    known[:, np.arange(known.shape[1]) % max(1, round(WINDOW_DISTANCE / dt)) > 0] = False
+    rotary, q = np.array(names.rotary, bool), q[known]
+    slides = q[:, ~rotary] - np.mean(q[:, ~rotary], axis=0)
+    others = np.concatenate([slides, v[known], u[known]], axis=1)
+    others = others / (np.sqrt(np.mean(others**2, axis=0)) + 1e-300)
+    state = np.concatenate([np.sin(q[:, rotary]), np.cos(q[:, rotary]), others], axis=1)
+    seq, row = np.nonzero(known)
+    return Places(seq, row, state)
 
 
 def neighbours(
     samples: Places, separation: int
 ) -> tuple[Int[np.ndarray, "place near"], Bool[np.ndarray, "place near"]]:
     """The places nearest to each in state space; True for those that count: of another moment, and one a moment."""
-    count = len(samples.seq)
-    near = min(128, count)
-    distance, place = KDTree(samples.state).query(samples.state, k=near, distance_upper_bound=NEIGHBOUR_DISTANCE)
-    distance, place = (a.reshape(count, near) for a in (distance, place))
+    near = min(128, len(samples.seq))
+    order, tree = np.arange(1, near + 1), KDTree(samples.state)
+    distance, place = tree.query(samples.state, k=order, distance_upper_bound=NEIGHBOUR_DISTANCE)
     known = np.isfinite(distance)
     place = np.where(known, place, 0)
     seq, row = samples.seq[place], samples.row[place]
     known &= (seq != samples.seq[:, None]) | (np.abs(row - samples.row[:, None]) >= separation)
     moment = seq * (1 + samples.row.max(initial=0) // separation) + row // separation
     counts = np.zeros(place.shape, bool)
-    for k in range(near):
-        twice = np.any(counts[:, :k] & (moment[:, :k] == moment[:, k : k + 1]), axis=1)
-        counts[:, k] = known[:, k] & ~twice & (counts.sum(axis=1) < NEIGHBOURS)
+    for moments, choice, count in zip(moment, known, counts, strict=True):
+        first = np.unique(moments[choice], return_index=True)[1]  # the nearest place of each moment
+        count[np.flatnonzero(choice)[np.sort(first)[:NEIGHBOURS]]] = True
     return place, counts
-
-
-def repeated(mean: Float[np.ndarray, " place"], samples: Places, at: int, separation: int) -> float:
-    """The largest share of a force that acts wherever the signals of one joint are the same."""
-    seq, row, shares = samples.seq, samples.row, [0.0]
-    away = ((seq != seq[at]) | (np.abs(row - row[at]) >= separation)) & np.isfinite(mean)
-    for subspace in samples.subspaces:
-        distance = np.where(away, np.linalg.norm(subspace - subspace[at], axis=1), np.inf)
-        order = np.argsort(distance)[:OTHERS]
-        order = order[distance[order] < VIEW]
-        if order.size > 2:
-            shares.append(float(np.mean(mean[order]) / mean[at]))
-    return max(shares)
 
 
 def disturbances(
@@ -185,8 +163,7 @@ def disturbances(
             sure = np.where((samples.seq == i) & (beside[None] <= reach), 0.0, sure)
             clock = float(residual.t[i, first]), float(residual.t[i, last])
             disturbance = Intervention(i, j + 1, first, last, *clock, size, std, names.force_unit(j + 1))
-            again = any(_away(disturbance, other) <= 0 for other in out)
-            if not again and repeated(means[k], samples, int(at), separation) < REPEATED:
+            if all(_away(disturbance, other) > 0 for other in out):
                 out.append(disturbance)
     # two pushes on a joint that are near each other are a swing of the machine
     alone = (a for a in out if not any(a is not b and _away(a, b) < separation for b in out))

@@ -35,12 +35,11 @@ def whiteness(e: Float[np.ndarray, "seq time"], lags: int = LAGS) -> tuple[float
 
     NaN is not measured.  [Ljung & Box 1978; Box, Jenkins, Reinsel & Ljung 2015, "Time Series Analysis", section 8.2]
     """
-    r, pairs = autocorrelation(e, lags)
+    r, pairs = (part[1:] for part in autocorrelation(e, lags))
     count = int(np.isfinite(e).sum())
-    known = pairs[1:] > 0
-    statistic = float((count + 2) / count * np.sum((pairs[1:] * r[1:] ** 2)[known]))
-    largest = r[1:][known][np.argmax(np.abs(r[1:][known]))] if known.any() else 0.0
-    return statistic, float(scipy.stats.chi2.sf(statistic, max(1, int(known.sum())))), float(largest)
+    statistic = (count + 2) / count * float(pairs @ r**2)
+    p_value = scipy.stats.chi2.sf(statistic, max(1, np.count_nonzero(pairs)))
+    return statistic, float(p_value), float(r[np.argmax(np.abs(r))]) if r.size else 0.0
 
 
 def autocorrelation(
@@ -58,9 +57,8 @@ def spread(e: Float[np.ndarray, "seq time"]) -> tuple[float, float, float]:
     """Normalised innovation squared: its mean (1 if the stated uncertainty is right), p-value, std minus 1. N times the
     mean is chi^2_N. [Bar-Shalom, Li & Kirubarajan 2001, section 5.4.2]
     """
-    x = e[np.isfinite(e)]
-    mean = float(np.mean(x**2))
-    tails = [tail(x.size * mean, x.size) for tail in (scipy.stats.chi2.sf, scipy.stats.chi2.cdf)]
+    count, mean = int(np.isfinite(e).sum()), float(np.nanmean(e**2))
+    tails = scipy.stats.chi2.sf(count * mean, count), scipy.stats.chi2.cdf(count * mean, count)
     return mean, min(1.0, 2 * float(min(tails))), math.sqrt(mean) - 1.0
 
 
@@ -73,13 +71,13 @@ def dependence(e: Float[np.ndarray, "seq time"], cause: Float[np.ndarray, "seq t
     seen = np.isfinite(e) & np.isfinite(cause)
     x, g = (np.where(seen, a - np.mean(a, where=seen), 0.0) for a in (e, cause))
     scale = math.sqrt(np.sum(x**2) * np.sum(g**2))
-    if not scale > 1e-9 * math.sqrt(seen.sum()) * max(1e-300, float(np.max(np.abs(cause), where=seen, initial=0))):
-        return 0.0, 1.0, 0.0  # a cause that never changes
-    sums = _group_sums(x * g, seen)
+    largest = float(np.max(np.abs(cause), where=seen, initial=1e-300))
+    varies = scale > 1e-9 * math.sqrt(seen.sum()) * largest  # a cause that never changes has no sums
+    sums = _group_sums(x * g, seen) if varies else np.zeros(0)
     if sums.size < 3 or not np.std(sums) > 0:
         return 0.0, 1.0, 0.0
-    t = float(np.mean(sums) / np.std(sums, ddof=1) * math.sqrt(sums.size))
-    return t, 2 * float(scipy.stats.t.sf(abs(t), sums.size - 1)), float(np.sum(x * g) / scale)
+    t, p_value = scipy.stats.ttest_1samp(sums, 0.0)
+    return float(t), float(p_value), float(np.sum(x * g) / scale)
 
 
 def _group_sums(values: Float[np.ndarray, "seq time"], seen: Bool[np.ndarray, "seq time"]):

@@ -129,7 +129,7 @@ def nearest(
     Without `dip` the breakaway torque is the Coulomb torque, without `constant` the constant torque is 0.
     """
     posterior = _posterior(v, torque, whitener)
-    return posterior.natural(posterior.modes(dip, constant, at_start=True)[0][1])
+    return posterior.natural(posterior.modes(dip, constant)[0][1])
 
 
 class _Posterior(NamedTuple):
@@ -143,7 +143,6 @@ class _Posterior(NamedTuple):
     whitener: Float[np.ndarray, "node node"]
     wide: Float[np.ndarray, " param"]
     """Sizes of the numbers by the range of the curve."""
-    middle: Float[np.ndarray, " param"] = np.array([0.0, 0.0, np.log(0.1), 0.0, np.log(0.02), 0.0])
 
     def natural(self, z: Float[np.ndarray, "... param"]) -> Float[np.ndarray, "... param"]:
         """PARAMETERS of laws."""
@@ -156,21 +155,19 @@ class _Posterior(NamedTuple):
         value = self.natural(z)
         away = (self.torque - curve(value.T[..., None], self.v)) @ self.whitener.T
         levels = np.stack([value[:, 0], value[:, 1] - value[:, 0], value[:, 3], value[:, 5]], 1)
-        times = (z - self.middle)[:, [2, 4]] / 2.0
+        times = (z[:, [2, 4]] - np.log([0.1, 0.02])) / 2.0
         return np.concatenate([away, levels / self.wide[[0, 1, 3, 5]], times], axis=1)
 
     def log_density(self, z: Float[np.ndarray, "law param"]) -> Float[np.ndarray, " law"]:
         """Levels are as likely before as they are wide, not as their logarithms."""
         return np.sum(z[:, [0, 1, 3]], axis=1) - 0.5 * np.sum(self.residual(z) ** 2, axis=1)
 
-    def modes(
-        self, dip: bool = True, constant: bool = True, *, at_start: bool = False
-    ) -> list[tuple[float, Float[np.ndarray, " param"]]]:
-        """Cost and place of minima from several starts, the best first; `at_start`: about which the prior is."""
+    def modes(self, dip: bool = True, constant: bool = True) -> list[tuple[float, Float[np.ndarray, " param"]]]:
+        """Cost and place of minima from several starts, the best first."""
         free, fits, no_dip = np.array([True, dip, dip, True, True, constant]), [], -200.0  # its logarithm
         for knee, sharpness in itertools.product(np.log([0.02, 0.1, 0.4]) if dip else [0.0], np.log([0.02, 0.1, 0.4])):
             start = np.array([np.log(0.3), np.log(0.3) if dip else no_dip, knee, np.log(0.3), sharpness - 1.5, 0.0])
-            fits.append((self._replace(middle=start) if at_start else self)._mode(start, free))
+            fits.append(self._mode(start, free))
         return sorted(fits, key=lambda fit: fit[0])
 
     def _mode(

@@ -21,7 +21,7 @@ from ..data.dataset import Dataset
 from ..model.base import AbstractModel
 from ..model.state_space import StateSpaceModel
 from ..numerics.gaussian import Gaussian
-from ..numerics.parallel import each, on_default_device
+from ..numerics.parallel import each, few_sizes, on_default_device
 from ..smoother.kalman import Cubature, Tangent, kalman_filter
 from ..smoother.posterior import Posterior
 from .prior import ParameterPrior
@@ -115,6 +115,12 @@ def _widened(prior: ParameterPrior, w, linear: Local, path: Gaussian, pad: int):
     wide = ParameterPrior(tuple(map(str, range(mean.shape[0]))), jnp.asarray(mean), jnp.asarray(std))
     moved = widen(linear.by_parameter), widen(linear.reading_by_parameter)
     return wide, jnp.asarray(widen(w)), moved, jax.tree.map(lambda a: np.asarray(a)[:, 0], path)
+
+
+def _lengthened(every: Any) -> Any:
+    """Arrays of all sequences, zero for more of them: one program for many numbers of sequences."""
+    size = few_sizes(len(jax.tree.leaves(every)[0]))
+    return jax.tree.map(lambda a: np.pad(np.asarray(a), [(0, size - len(a))] + [(0, 0)] * (a.ndim - 1)), every)
 
 
 @eqx.filter_jit
@@ -248,12 +254,12 @@ class ScoringMStep(AbstractMStep):
         linear = linear._replace(by_parameter=of_state, reading_by_parameter=of_reading)  # pyrefly: ignore[bad-argument-type]
         common = (core.log_q, core.log_r, core.start, rule.weights(core).nodes)
         terms = each(_quadratic, common, (linear, posterior, read))
-        every = terms, first, posterior.loglik, used
+        every = _lengthened((terms, first, posterior.loglik, used))
         core, hessian, took_part = _advance(*on_default_device((rule, core._replace(w=w), *every)))
         if linear.reading_by_force is not None:
             core = core._replace(log_r=_noise_floor(linear, core.log_q, core.log_r))
-        size = hessian.shape[0] - pad
-        return core._replace(w=core.w[: core.w.shape[0] - pad]), hessian[:size, :size], np.asarray(took_part)
+        took_part, size = np.asarray(took_part)[: len(used)], hessian.shape[0] - pad
+        return core._replace(w=core.w[: core.w.shape[0] - pad]), hessian[:size, :size], took_part
 
     def noise(self, model: Core, total: Quadratic, dof: int) -> tuple[Float[Array, " state"], Float[Array, " obs"]]:
         """Log variances of process and reading noise after the step."""

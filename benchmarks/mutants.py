@@ -864,6 +864,10 @@ branches of a hidden angle lost by a search
 - (fit._replace(smoother=CubatureSmoother(fit.bank)) for
 + (fit for
 # diagnosis/equations.py
+## test_equation_laws.py::test_of_two_laws_the_share_that_is_lost_without_each_decides
+a law of equations is lost with all others
+- 1 - whole / left(one, search.fit(one, [((), ())]).get(0))
++ 1 - left(one, search.fit(one, [((), ())]).get(0)) / whole
 ## test_equation_laws.py::test_a_strength_that_is_not_determined_is_refused
 a strength of equations that is not determined
 - certainty(*each) >= DETERMINED for

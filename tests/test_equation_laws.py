@@ -16,7 +16,7 @@ from nnap_em.data.dataset import pad
 from nnap_em.data.rig import read_rig
 from nnap_em.diagnosis import equations
 from nnap_em.diagnosis.equations import FOLDS, Case, by_simulation, folds
-from nnap_em.diagnosis.hypothesis import declared
+from nnap_em.diagnosis.hypothesis import Evidence, declared
 from nnap_em.diagnosis.search import Progress, search
 from nnap_em.effects import Candidate, OperatingPoint, SensorEffect, catalogue
 from nnap_em.effects.equations import UnknownTerm
@@ -251,6 +251,18 @@ def test_a_search_that_fails_late_or_is_out_of_time_keeps_what_it_has(chain, mon
     monkeypatch.setattr(equations.simulated, "fit_all", whole)
     late = _searched(before, data, end=0.0)
     assert (late.complete, late.after.model.effects, len(late.steps)) == (False, (), 1)
+
+
+def test_of_two_laws_the_share_that_is_lost_without_each_decides(chain):
+    """The flow b^2 out of a is in the log, another in proportion to b is not; a law of the declaration stays."""
+    (before, data), hypothesis = chain, declared(chain[0])
+    for name, strength in (("square_flow", -0.25), ("linear_flow", 0.001)):
+        laws = catalogue[name].candidates(equations.around_of(before, data))
+        law = next(c for c in laws if (c.start.channel, c.start.reads) == ("a", ("b",)))
+        effect = dataclasses.replace(law.start, strength=jnp.asarray(strength))
+        hypothesis = hypothesis.plus(effect, law, Evidence(share=0.5, candidate=law))
+    square, linear = by_simulation(before, data, lambda text: None).lost(hypothesis)
+    assert square > 0.5 and abs(linear) < 0.05
 
 
 def test_a_draft_of_equations_needs_only_the_rates(tmp_path):

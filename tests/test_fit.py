@@ -160,6 +160,25 @@ def test_em_rests_where_nothing_moves():
         assert not loop._ended(_state([0.0], **changes), Schedule(first=4, hold=1), 9, 0.05)  # not yet the whole
 
 
+WHOLE = [0.0, 90.0, 6.0, 6.0]
+RISES = [
+    ([*WHOLE, 6.04, 6.08], {}, 0.0),
+    ([*WHOLE, 6.04, 6.11], {}, 0.11),
+    ([*WHOLE, 6.5, 6.2], {}, 0.5),  # the last step was tried, and refused
+    ([*WHOLE, 5.0, 6.9], {"ess": 100.0}, 0.0),  # by chance, of a sample
+    ([*WHOLE, 5.0, loop.DIVERGED, 7.1], {"ess": 100.0}, 1.1),  # a refused step says nothing of chance
+    (WHOLE, {}, np.inf),
+    ([*WHOLE[1:], 6.0], {"epoch": 5}, 0.0),  # begun from another fit, whose first epoch counts
+]
+
+
+def test_a_fit_that_its_epochs_end_has_the_rise_of_its_likelihood():
+    """Two epochs see 4 of 9 samples; what they reached is no measure of the others, and two others are too few."""
+    for loglik, changes, rise in RISES:
+        state = _state([0.0], **{"epoch": len(loglik), "ess": np.inf, "loglik": np.array(loglik), **changes})
+        assert loop.unsettled(state, Schedule(first=4, growth=3.0, hold=1), 9) == pytest.approx(rise)
+
+
 def test_the_likeliest_process_noise_is_where_it_begins(monkeypatch):
     tried = []
 

@@ -43,7 +43,7 @@ class Progress(NamedTuple):
 
 
 class Method(NamedTuple):
-    """What a search leaves to the kind of its errors: along smoothed paths, or in free simulations of equations."""
+    """Functions of a search that depend on the kind of its errors: along smoothed paths, or in free simulations."""
 
     lengths: list[int]
     """Rows over which rounds look for a first law in turn; further ones are looked for over the last."""

@@ -244,6 +244,20 @@ def _released(state: EMState) -> EMState:
     return state._replace(stage=state.stage + 1, since=state.epoch)
 
 
+def unsettled(state: EMState, schedule: Schedule, longest: int) -> float:
+    """Rise of the log-likelihood in the last two epochs of a fit [nat a sequence]; 0 for one that is at rest, infinite
+    where fewer than three epochs saw whole sequences. A sampled likelihood rises by more than it ever fell.
+    """
+    epochs = range(state.epoch - len(state.loglik), state.epoch)  # a fit begun from another starts at 1
+    every = [(schedule.horizon(epoch, longest), v) for epoch, v in zip(epochs, state.loglik, strict=True)]
+    whole = [v for seen, v in every if seen == longest and v > DIVERGED]  # a refused step is none
+    if len(whole) < 3:
+        return math.inf
+    least = 2 * REST if math.isinf(state.ess) else max(2 * REST, float(np.max(-np.diff(whole))))
+    rise = float(max(whole[-2:]) - max(whole[:-2]))
+    return rise if rise >= least else 0.0
+
+
 def _rise(state: EMState, path: Gaussian, data: Dataset, rule, used: Bool[np.ndarray, " seq"]) -> float:
     """Rise of the log-likelihood from the best model to the one that was tried, beyond what is known [nat a sequence].
 

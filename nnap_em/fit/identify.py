@@ -17,7 +17,19 @@ from ..effects import AbstractEffect
 from ..em import simulated
 from ..em.build import build, build_system
 from ..em.equations import infinite_rates
-from ..em.loop import EPOCHS, RESTED, SCHEDULE, SPENT, WIDENED, EMState, Schedule, e_step, fit, later_state, start_state
+from ..em.loop import (
+    EPOCHS,
+    RESTED,
+    SCHEDULE,
+    WIDENED,
+    EMState,
+    Schedule,
+    e_step,
+    fit,
+    later_state,
+    start_state,
+    unsettled,
+)
 from ..em.mstep import ScoringMStep, not_diverged
 from ..em.multistep import JUDGED, LEAST_FALL, errors, finish, followed, ratio
 from ..em.prior import ParameterPrior
@@ -51,6 +63,8 @@ class Identified(NamedTuple):
     """Smoother of the fit and of all that uses it: prediction, residuals and the search for missing effects."""
     discrepancy: float = 0.0
     """Size of the forces that no part of the model describes (`stated.widened`); 0 where likelihood is efficient."""
+    rise: float = 0.0
+    """Rise of the log-likelihood at the end of EM (`loop.unsettled`) [nat a sequence]: more epochs would go on."""
     accuracy: tuple[tuple, ...] = ()
     """Errors of predictions along the training logs, beside motion and noise: `misfit.Accuracy` of every reading."""
 
@@ -66,8 +80,8 @@ class Identified(NamedTuple):
 
     @property
     def misfit(self) -> Misfit:
-        """The word on how well the fit describes the motion; random forces count where EM was not cut short."""
-        return misfit(self.accuracy, settled=self.state.stop != SPENT)
+        """The word on how well the fit describes the motion; random forces count once EM is at rest."""
+        return misfit(self.accuracy, settled=not self.rise)
 
     def __str__(self) -> str:
         estimated = {name: Declared(*pair) for name, pair in parameter_table(self).items()}
@@ -159,7 +173,9 @@ def identify(
     fitted = begin(rig, data, key=key) if start is None else start
     fitted = fitted if smoother is None else fitted._replace(smoother=smoother(fitted.bank))
     state = fit(fitted.state, data, fitted.smoother, fitted.m_step, epochs=epochs, schedule=schedule, watch=watch)
-    return finished(fitted._replace(state=state), data)
+    fitted = fitted._replace(state=state)
+    rise = unsettled(fitted.state, schedule, int(np.max(np.sum(np.asarray(data.valid), axis=1))))
+    return finished(fitted._replace(rise=rise), data)
 
 
 PARTS_LEFT_OUT = 2

@@ -71,10 +71,11 @@ def arriving(
     u: Float[Array, "*time column"],
     through: Callable[..., Array],
 ) -> tuple[Float[Array, "*time input"], Float[Array, "*time column"] | None]:
-    """What the input columns of a sequence, or of one row, set at the drives, with the effects that take time.
+    """Values at the drives by the input columns of a sequence, or of one row, with the effects that take time; beside
+    them the columns that numbers of the servos are proportional to (`Servo.at`).
 
-    Torques at the joints [N m], or of servos what commands set in them (`Servo.fed`).  Beside it the columns that
-    numbers of the servos are proportional to (`Servo.at`).  `through` is that of `Sampling`, or the same row by row.
+    They are torques at the joints [N m], or values that commands set in servos (`Servo.fed`).  `through` is that of
+    `Sampling`, or the same row by row.
     """
     drives = len(system.drives)
     u, scale = u[..., :drives], u[..., drives:] if u.shape[-1] > drives else None

@@ -14,7 +14,7 @@ from ..data.logs import Logs
 from ..diagnosis.keys import listed
 from ..diagnosis.residual import names_of
 from ..em.build import build_system
-from ..em.loop import SPENT, STEP_REFUSED
+from ..em.loop import STEP_REFUSED
 from ..fit.check import dynamics
 from ..fit.identify import FrictionTable, Identified, friction_table
 from ..fit.misfit import Moved, moved
@@ -103,7 +103,7 @@ def _verdict(
     used = f"{sequences - diverged} of " * bool(diverged) + counted(sequences, "sequence")
     rested = f" in {counted(fitted.state.epoch, 'epoch')}"
     rested += f", until {fitted.state.stop}" * (fitted.state.stop == STEP_REFUSED)
-    early = f"; {_stopped_early(fitted)}" if fitted.state.stop == SPENT else rested
+    early = f"; {_stopped_early(fitted)}" if fitted.rise else rested
     text, word = f"Fitted {estimated} to {used}{early}.", fitted.misfit.text
     causes = f"{'; '.join(causes)}." if causes else ""
     parts = [word, causes, text] if fitted.misfit.useless else [causes, text, word]
@@ -112,8 +112,11 @@ def _verdict(
 
 def _stopped_early(fitted: Identified) -> str:
     """Sentence about a fit that its number of epochs ended; empty for one that came to rest."""
-    early = f"stopped after {counted(fitted.state.epoch, 'epoch')}, before EM was at rest: give it more with --epochs"
-    return early if fitted.state.stop == SPENT else ""
+    if not fitted.rise:
+        return ""
+    how = f"while the log-likelihood still rose by {fitted.rise:.2g} nat a sequence"
+    how = how if math.isfinite(fitted.rise) else "that mostly saw the beginning of the sequences"
+    return f"stopped after {counted(fitted.state.epoch, 'epoch')} {how}: give it more with --epochs"
 
 
 def _log_summary(document: dict[str, Any], log: Log) -> None:

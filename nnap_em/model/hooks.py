@@ -7,7 +7,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..effects.base import AbstractEffect, OperatingPoint, Scalar, Stream
-from ..systems.base import AbstractSystem
 from ..systems.plant import AbstractPlant
 from .servo import Servo
 
@@ -143,10 +142,10 @@ def command_stream(
 def driven(
     effects: Effects,
     servos: Sequence[Servo] | None,
-    system: AbstractSystem,
+    system: Any,
     u: Float[Array, " input"],
-    q: Float[Array, " dof"],
-    v: Float[Array, " dof"],
+    q: Float[Array, " coordinate"],
+    v: Float[Array, " speed"],
     scale: Float[Array, " column"] | None = None,
 ) -> Float[Array, " input"]:
     """Torque of every drive at one moment, with the effects that take none [N m, before the gear]; or `u`."""

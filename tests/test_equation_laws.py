@@ -32,13 +32,13 @@ from nnap_em.storage.deadline import TimeUp
 from nnap_em.systems import Equations, specs
 
 PLANT = {
-    "states": {"a": "m", "b": "m"}, "inputs": {"u": "V"}, "rates": {"a": "u - a", "b": "a - b"}, "readings": {},
-    "parameters": [], "terms": {}, "enters": {}, "units": {}, "function": "",
+    "states": {"a": "m", "b": "m"}, "inputs": {"u": "V"}, "rates": {"a": "u - a", "b": "k*a - b"}, "readings": {},
+    "parameters": ["k"], "terms": {}, "enters": {}, "units": {}, "function": "",
 }  # fmt: skip
 
 
 def _pushes(effect, a=2.0, b=0.5, u=3.0):
-    system = Equations({}, json.dumps(PLANT))
+    system = Equations({"k": jnp.ones(())}, json.dumps(PLANT))
     q, inputs, none = jnp.asarray([a, b]), jnp.asarray([u]), jnp.zeros(2)
     scene = OperatingPoint(system, q, q[:0], none, jnp.zeros(()), none, None, inputs)  # type: ignore[arg-type]
     return np.asarray(effect.force(scene, jnp.zeros(0)))
@@ -48,11 +48,14 @@ LAWS = {
     "constant_flow": (("a", (), None), [0.3, 0.0]),
     "linear_flow": (("b", ("a",), None), [0.0, 0.3 * 2.0]),
     "square_flow": (("b", ("a",), None), [0.0, 0.3 * 4.0]),
+    "cubic_flow": (("b", ("a",), None), [0.0, 0.3 * 8.0]),
+    "power_flow": (("b", ("a",), None), [0.0, 0.3 * 2.0**1.2]),
     "product_flow": (("a", ("b", "u"), None), [0.3 * 0.5 * 3.0, 0.0]),
     "threshold_flow": (("b", ("a",), None), [0.0, 0.3 * (2.0 - 1.2)]),
     "exchange": (("a", ("a", "b"), "b"), [-0.3 * 1.5, 0.3 * 1.5]),
     "transfer": (("a", ("a",), "b"), [-0.3 * 0.8, 0.7 * 0.3 * 0.8]),
-    "overflow": (("a", ("a", "u"), "b"), [-0.3 * 3.0, 0.7 * 0.3 * 3.0]),
+    "ceiling": (("a", ("a",), None), [-0.3 * 1.0, 0.0]),
+    "overflow": (("a", ("a",), "b"), [-0.3 * 1.0, 0.7 * 0.3 * 1.0]),
 }
 
 
@@ -65,9 +68,18 @@ def test_a_law_pushes_as_its_formula_says():
         assert np.abs(_pushes(below)).max() < 1e-100 or "level" not in law.reports
 
 
+def test_a_parameter_that_varies_pushes_as_the_equations_with_another_one():
+    law = catalogue["varying_parameter"](slope=0.3, middle=1.0, channel="k", reads=("u",))  # k = 1 + 0.3 (3 - 1)
+    np.testing.assert_allclose(_pushes(law), [0.0, 0.6 * 2.0], rtol=1e-12)
+
+
 def test_units_of_a_law_are_those_of_its_port_and_signals():
     system = Equations({}, json.dumps(PLANT))
-    for name, reads, unit in (("linear_flow", ("b",), "1/s"), ("product_flow", ("b", "u"), "m/s/(m V)")):
+    for name, reads, unit in (
+        ("linear_flow", ("b",), "1/s"),
+        ("product_flow", ("b", "u"), "m/s/(m V)"),
+        ("power_flow", ("u",), "m/s/(V)^power"),
+    ):
         law = catalogue[name](strength=0.1, channel="a", reads=reads)
         assert law.units_on(system)["strength"] == unit
 
@@ -123,14 +135,38 @@ def test_a_strength_that_is_not_determined_is_refused():
 
 
 def test_noise_of_readings_is_no_room_for_laws():
-    rng, slow = np.random.default_rng(0), np.sin(np.arange(400) / 20)[None, None, :, None]
-    data = _logs(0.0)
-    search = equations.Search(None, data._replace(y=jnp.full_like(data.y, jnp.nan)), print, (), ())  # type: ignore[arg-type]
-    for amplitude, room in ((0.0, 0.0), (2.0, 2 / 3)):
-        error = rng.standard_normal((1, 1, 400, 1)) + amplitude * slow
-        of = _case(1.0, 1, 0.5, error).of
-        out = search._replace(scale=np.sqrt(np.mean(error**2)), data=data._replace(y=10 * jnp.asarray(error[0])))
-        np.testing.assert_allclose(out.room(of), room, atol=0.12)
+    """Of unit noise and a sine; of one of nine rows a period the noise that EM found tells the two apart."""
+    rng, row, data = np.random.default_rng(0), np.arange(400), _logs(0.0)
+    for amplitude, period, em, room in ((0.0, 126, 9.0, 0.0), (2.0, 126, 9.0, 2 / 3), (2.0, 9, 1.0, 2 / 3)):
+        error = rng.standard_normal((1, 1, 400, 1)) + amplitude * np.sin(2 * np.pi * row / period)[:, None]
+        before = SimpleNamespace(model=SimpleNamespace(log_r=np.log([em])))
+        data = data._replace(y=10 * jnp.asarray(error[0]))
+        search = equations.Search(before, data, print, (), ())  # type: ignore[arg-type]
+        out = search._replace(scale=np.sqrt(np.mean(error**2)))
+        np.testing.assert_allclose(out.room(_case(1.0, 1, 0.5, error).of), room, atol=0.12)
+
+
+def test_laws_that_make_a_reading_worse_at_some_age_are_refused():
+    """Two readings at three ages on four parts; one error of twelve rises, by a fifth of its square."""
+    before = np.ones((4, 3, 2))
+    after = 0.5 * before
+    assert not equations.worsens(before, after)
+    for rise, parts, worse in ((1.2, 4, True), (1.2, 3, True), (1.05, 4, False), (1.2, 2, False)):
+        after[:, 1, 1] = np.where(np.arange(4) < parts, rise, 1.1 if parts < 3 else 1.05)
+        after[parts:, 1, 1] = 0.999
+        assert equations.worsens(before, after) == worse
+
+
+def test_what_is_as_good_in_the_place_of_a_law_is_told():
+    one, two, three = (catalogue[name] for name in ("linear_flow", "square_flow", "motor_gain"))
+    a, b = (kind(strength=0.0, channel="a", reads=("a",)) for kind in (one, two))
+    c, of = three.of(0.0, channel="u"), _case(1.0, 1, 0.9)
+    sets = (a, c), (c, b), (b,), (a, b)
+    cases = [of._replace(laws=tuple(Candidate(law, (), law) for law in laws)) for laws in sets]
+    key = equations.key_of
+    assert equations._in_place_of(key(a), cases[0], cases) == (key(b),)
+    assert equations._in_place_of(key(c), cases[0], cases) == (key(b),)
+    assert cases[0].places == {"a", "u"} and cases[2].places == {"a"}
 
 
 def test_the_common_form_of_a_free_function_is_the_same_function():

@@ -1,6 +1,7 @@
 """Plants that are written as equations: formulas, declaration, model, errors over long horizons."""
 
 import dataclasses
+import json
 import math
 from pathlib import Path
 
@@ -119,6 +120,7 @@ DECLARED = [  # a text of the declaration, what stands in its place, and what is
     ('{ u = "V" }', '{ u = "" }', "[model.inputs] u: missing unit"),
     ('{ y = "b" }', '{ y = "c" }', "[measurement.columns] y: at character 1"),
     ('{ y = "b" }', '["c"]', "'c' is no state; possible here: a, b"),
+    ("[mea", 'open = ["c"]\n[mea', "[model] open: 'c' is no state; possible here: a, b"),
     ("[mea", "[model.unknown]\nf = { signals = ['c'], enters = 'a' }\n[mea", "'c' is no state or input"),
 ]
 
@@ -129,6 +131,18 @@ def test_a_mistake_in_the_declaration_is_named_by_file_key_and_place(tmp_path):
         with pytest.raises(RigError) as error:
             _rig(tmp_path, CHAIN.replace(wrong, right))
         assert str(error.value).startswith(f"{tmp_path / 'rig.toml'}: ") and words in str(error.value)
+
+
+def test_a_rate_without_an_estimated_number_lacks_nothing(tmp_path):
+    """b' = (a - b)/tb has a trusted one; `exact` closes others, `open` opens, and nothing stands in a constant."""
+    exact = lambda text: sorted(json.loads(_rig(tmp_path, text).equations)["exact"])  # noqa: E731
+    more = {"": ["b"], 'exact = ["a"]': ["a", "b"], 'open = ["b"]': [], 'exact = ["a"]\nopen = ["b"]': ["a"]}
+    for line, closed in more.items():
+        assert exact(CHAIN.replace("[measurement]", f"{line}\n[measurement]")) == closed
+    trusted = CHAIN.replace("{ mean = 1.0, std = 0.5 }", "1.0").replace("{ mean = 4.0, std = 2.0 }", "4.0")
+    assert exact(trusted) == []  # no number is estimated
+    assert exact(trusted.replace("(a - b)/tb", "a - b").replace("tb = 2.0\n", "")) == ["b"]
+    assert exact(CHAIN.replace("(a - b)/tb", "0").replace("tb = 2.0\n", "")) == []
 
 
 def test_a_declaration_is_the_same_after_writing_it(tmp_path):
@@ -187,6 +201,7 @@ def test_predictions_of_an_unstable_plant_end_when_errors_have_grown_e_fold(chai
     none = np.zeros((0, 2))
     seen = Motion(none, none, none, 1.0, 4.0)
     assert pace_of(rig, seen, 1000) == 32.0
+    assert pace_of(rig, seen._replace(kept=("a",)), 1000) == 170.0  # a third of the rows
     assert pace_of(rig, seen._replace(growth=0.2), 1000) == 5.0
     assert pace_of(rig, seen._replace(growth=2.0), 1000) == 2.0  # four rows
     assert pace_of(dataclasses.replace(rig, horizon=9.0), seen._replace(growth=0.2), 1000) == 9.0

@@ -13,12 +13,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 
 from ..data.dataset import Dataset
 from ..effects import AbstractEffect, Candidate, SearchScales, SensorEffect, catalogue, flat
 from ..effects.actuator import DriveEffect
-from ..effects.equations import STRONG, PortEffect
+from ..effects.equations import STRONG, SignalEffect
 from ..em import simulated
 from ..em.equations import free_term, motion
 from ..em.readings import reading_noise
@@ -31,9 +31,9 @@ from .keys import Key, complexity, key_of, words
 from .outcome import Step, Suspect
 from .search import Method, Round
 from .trial import certainty
-from .verdict import DETERMINED, EQUIVALENT_NATS, MULTI_STEP, NAMED, agreed, even, suspected
+from .verdict import AGREE, DETERMINED, EQUIVALENT, EQUIVALENT_NATS, MULTI_STEP, NAMED, agreed, even, suspected
 
-FOLDS, BLOCKS = 4, 8
+FOLDS, BLOCKS = 4, 16
 """Parts that are left out in turn, each of every fourth block of the rows."""
 SHORTLIST, FREE, PARTNERS, PAIRS_JUDGED = 4, 2, 16, 8
 """Laws of one, of two and of three numbers, and free functions, that are judged on parts left out; laws of which pairs
@@ -41,6 +41,8 @@ are tried, and pairs judged."""
 MEASURE = "share of the squared error"
 GROWN = 64.0
 """Pace over which sizes of delays and lags are grown: an eighth of a slowest time constant."""
+Cells = Float[np.ndarray, "*part age obs"]
+"""Squared errors, of starts that are not settled first."""
 SCREEN_STEPS, JUDGED_STEPS = 30, 30
 """Steps of a fit in a screen, and of one that is judged."""
 
@@ -56,6 +58,8 @@ class Case(NamedTuple):
     left: float = math.nan
     """Share of the squared error on parts left out that they remove, and what they leave."""
     folds: tuple[float, ...] = ()
+    harms: bool = False
+    """True where some reading is worse with them, at some horizon."""
 
     @property
     def effects(self) -> tuple[AbstractEffect, ...]:
@@ -83,6 +87,11 @@ class Case(NamedTuple):
         """Their names."""
         return tuple(key_of(law.start) for law in self.laws)
 
+    @property
+    def places(self) -> set[str | None]:
+        """Ports, inputs and readings where they are, and signals of which they are functions."""
+        return {name for key in self.keys for name in (key[2], *key[3])}
+
 
 class Search(NamedTuple):
     """Constants of a search."""
@@ -102,17 +111,23 @@ class Search(NamedTuple):
         """The hypothesis with some laws more, which begin with the numbers of `starts`."""
         system = hypothesis.model.system
         for law, start in zip(laws, starts, strict=True):
-            lean = Candidate(law.start.lean(system), (), law.prior_std.lean(system))
+            none = law.start if law.start.linear else start
+            lean = Candidate(none.lean(system), (), law.prior_std.lean(system))
             hypothesis = hypothesis.plus(start.lean(system), lean)
         return hypothesis
 
     def fit(
-        self, hypothesis: Hypothesis, every: Sequence[tuple[Sequence[Candidate], Sequence[Any]]], **options: Any
+        self,
+        hypothesis: Hypothesis,
+        every: Sequence[tuple[Sequence[Candidate], Sequence[Any]]],
+        begun: Sequence[Any] = (),
+        **options: Any,
     ) -> dict[int, Case]:
-        """The hypothesis with each of some sets of laws, and the numbers that these begin with, fitted, by their place.
-        What cannot be fitted, or not in time, is left out.
+        """The hypothesis with each of some sets of laws, and the numbers that these begin with, fitted, by their place;
+        from the models `begun`, if there are any. What cannot be fitted, or not in time, is left out.
         """
         full = [self.with_laws(hypothesis, laws, starts) for laws, starts in every]
+        full = [one.refitted(model) for one, model in zip(full, begun, strict=True)] if begun else full
         groups: dict[Any, list[int]] = {}
         for i, one in enumerate(full):
             both = one.model, one.m_step.prior
@@ -142,31 +157,50 @@ class Search(NamedTuple):
             best.setdefault(case.keys, case)
         return list(best.values())
 
-    def judged(self, hypothesis: Hypothesis, cases: Sequence[Case], null: Sequence[float]) -> list[Case]:
+    def judged(self, hypothesis: Hypothesis, cases: Sequence[Case], null: Cells) -> list[Case]:
         """The cases with their errors on parts left out, beside those of `null` on each."""
         out = []
         for i, left in self.left_out(hypothesis, cases).items():
-            gains = tuple(1 - b / max(a, 1e-12) for a, b in zip(null, left, strict=True))
-            share = 1 - sum(left) / max(sum(null), 1e-12)
-            out.append(cases[i]._replace(share=share, left=sum(left), folds=gains))
+            before, after = (cells[:, 1:].sum(axis=(1, 2)) for cells in (null, left))
+            gains = tuple(1 - after / np.maximum(before, 1e-12))
+            share = 1 - after.sum() / max(before.sum(), 1e-12)
+            out.append(cases[i]._replace(share=share, left=after.sum(), folds=gains, harms=worsens(null, left)))
         return out
 
     def room(self, of: simulated.Simulated) -> float:
         """Share of the squared error that is not noise of the readings: no law can remove more. The noise is the
-        smaller of that in the logs and that in the errors, half their mean square change from one to the next [von
-        Neumann 1941, Annals of Mathematical Statistics 12(4), 367].
+        smallest of that of EM, that in the logs and that in the errors, half their mean square change from one to the
+        next [von Neumann 1941, Annals of Mathematical Statistics 12(4), 367]: the last two hold a part of what is fast.
         """
         logs = np.array([reading_noise(y) for y in np.moveaxis(np.asarray(self.data.y), -1, 0)])
         change = np.ma.mean(np.diff(np.ma.masked_invalid(of.error), axis=2) ** 2, axis=(0, 1, 2)) / 2
-        return 1 - float(np.mean(np.minimum(logs**2, np.ma.filled(change, np.inf)) / self.scale**2))
+        every = np.exp(np.asarray(self.before.model.log_r)), logs**2, np.ma.filled(change, np.inf)
+        return 1 - float(np.mean(np.min(every, axis=0) / self.scale**2))
 
-    def left_out(self, hypothesis: Hypothesis, cases: Sequence[Case]) -> dict[int, list[float]]:
+    def cells(self, of: simulated.Simulated, counts: Bool[np.ndarray, "seq window #place 1"]) -> Cells:
+        """Squared errors by age and reading: where the start is not settled all, later those that count, in halves."""
+        at = simulated.windows(of.model, self.data)
+        age, costs = np.arange(0, at.rows, at.every), simulated.costs(of.error, self.scale, of.observed)
+        bounds = 0, at.settles, (at.settles + at.rows) // 2, at.rows
+        ages = [(low <= age) & (age < high) for low, high in itertools.pairwise(bounds)]
+        costs = costs * np.where((age < at.settles)[:, None], 1.0, counts)
+        return np.stack([costs[:, :, some].sum(axis=(0, 1, 2)) for some in ages])
+
+    def left_out(self, hypothesis: Hypothesis, cases: Sequence[Case]) -> dict[int, Cells]:
         """Squared errors of every case on every part by the fit to the others; only where all fits came to an end."""
         every, out = [(case.laws, case.effects) for case in cases], {i: [] for i in range(len(cases))}
         for counts in folds(simulated.windows(self.before.model, self.data), len(self.data.t)) if cases else ():
-            fits = self.fit(hypothesis, every, counts=~counts, steps=JUDGED_STEPS)
-            out = {i: [*errors, self.loss(fits[i].of, counts)] for i, errors in out.items() if i in fits}
-        return out
+            fits = self.fit(hypothesis, every, [case.of.model for case in cases], counts=~counts, steps=JUDGED_STEPS)
+            out = {i: [*errors, self.cells(fits[i].of, counts)] for i, errors in out.items() if i in fits}
+        return {i: np.stack(parts) for i, parts in out.items()}
+
+
+def worsens(before: Cells, after: Cells) -> bool:
+    """True where the errors of some reading rise with laws, at some age, on most parts and in all by more than laws
+    that explain the same differ.
+    """
+    risen = (after > before).mean(axis=0) >= AGREE
+    return bool(np.any(risen & (before.sum(axis=0) < EQUIVALENT * after.sum(axis=0))))
 
 
 def folds(at: simulated.Windows, sequences: int) -> list[Bool[np.ndarray, "seq window place 1"]]:
@@ -215,7 +249,7 @@ def free_functions(before: Identified, around: SearchScales, data: Dataset) -> l
 def by_simulation(before: Identified, data: Dataset, log: Log) -> Method:
     """The search for laws that equations lack, one or two at a time."""
     around = around_of(before, data)
-    kinds = [kind for kind in catalogue.values() if issubclass(kind, PortEffect | SensorEffect | DriveEffect)]
+    kinds = [kind for kind in catalogue.values() if issubclass(kind, SignalEffect | SensorEffect | DriveEffect)]
     every = [candidate for kind in kinds for candidate in kind.candidates(around)]
     search = Search(before, data, log, every, free_functions(before, around, data))
     rows = int(np.asarray(data.valid).sum(axis=1).max())
@@ -250,7 +284,8 @@ def _lost(search: Search, hypothesis: Hypothesis) -> list[float]:
     if len(laws) < 2:  # of one law the round has just said so
         return shares
     search, lean, full = _prepared(search, hypothesis)
-    left = lambda one, case: sum(search.left_out(one, [case]).get(0, [math.nan])) if case else math.nan  # noqa: E731
+    nothing = np.full((1, 2, 1), math.nan)
+    left = lambda one, case: search.left_out(one, [case] if case else []).get(0, nothing)[:, 1:].sum()  # noqa: E731
     whole = left(lean, full)
     for i in laws:
         one = lean.without(i)
@@ -276,7 +311,12 @@ def _round(search: Search, hypothesis: Hypothesis, rows: int) -> Round:
     if room < MULTI_STEP:
         return nothing
     singles = search.screened(lean, some)
-    short = [case for n in range(1, 4) for case in [c for c in singles if c.numbers == n and c.sound][:SHORTLIST]]
+    short = []
+    for numbers in range(1, 4):
+        sound = [case for case in singles if case.numbers == numbers and case.sound]
+        gains = [1 - search.loss(case.of) / whole for case in sound]
+        ties = len(even(gains)) if sound else 0  # as good as the best: the logs may not discriminate them
+        short += sound[: min(max(SHORTLIST, ties), 2 * SHORTLIST)]
     judged = search.judged(lean, short, parts[0])
     passing, tried = [case for case in judged if _passes(case)], [*judged]
     if room > max([MULTI_STEP, *(case.share for case in passing)]) / NAMED:  # else no pair, no function could be chosen
@@ -293,14 +333,18 @@ def _round(search: Search, hypothesis: Hypothesis, rows: int) -> Round:
         search.log(f"  {laws}: {case.share:.0%} of the squared error on parts left out")
     listed = tuple((case.keys[0], 1 - search.loss(case.of) / whole) for case in singles)
     step = Step(rows, listed, tuple((case.keys[-1], case.share) for case in tried), None, MEASURE)
-    best, alike = _chosen(passing)
+    best, alike, tied = _chosen(passing)
     complete = not late()
     if best is None:
         near = sorted((c for c in judged if suspected(c.share, MULTI_STEP) and c.sound), key=lambda c: -c.share)
         suspects = tuple(Suspect(case.keys[0], case.share, math.nan) for case in near[:4])
         return Round(step._replace(suspects=suspects), complete=complete)
-    same = tuple(case.keys[0] for case in alike if case is not best and len(case.laws) == 1)
+    if rivals := [case for case in alike if len(case.laws) == 1 and case.places.isdisjoint(best.places)]:
+        keys = tuple(key for case in (best, *rivals) for key in case.keys)
+        search.log(f"  cannot tell: {', '.join(map(words, keys))} explain the same; none is added")
+        return Round(step._replace(rivals=keys), complete=complete)
     for law, effect in zip(best.laws, best.effects, strict=True):
+        same = _in_place_of(key_of(law.start), best, tied)
         record = Evidence(equivalent=same, share=best.share, removed=best.share, candidate=law)
         hypothesis = hypothesis.plus(effect, law, record)
         search.log(f"  added {words(key_of(effect))}")
@@ -310,9 +354,19 @@ def _round(search: Search, hypothesis: Hypothesis, rows: int) -> Round:
     return Round(step._replace(accepted=best.keys[0]), hypothesis.refitted(model), complete)
 
 
+def _in_place_of(key: Key, best: Case, tied: Sequence[Case]) -> tuple[Key, ...]:
+    """Named laws with which the others of `best` are worth as much as with the law `key` of it."""
+    others, out = {*best.keys} - {key}, dict.fromkeys(())
+    for case in tied:
+        fresh = [law.start for law in case.laws if key_of(law.start) not in others]
+        if len(case.laws) == len(best.laws) and len(fresh) == 1 and fresh[0].named:
+            out[key_of(fresh[0])] = None
+    return tuple(name for name in out if name != key)
+
+
 def _passes(case: Case) -> bool:
     """True where the parts left out confirm that the laws remove a share of the squared error."""
-    return case.worth >= MULTI_STEP and agreed(case.folds) and case.sound and _certain(case)
+    return case.worth >= MULTI_STEP and agreed(case.folds) and case.sound and not case.harms and _certain(case)
 
 
 def _certain(case: Case) -> bool:
@@ -321,16 +375,19 @@ def _certain(case: Case) -> bool:
     return all(certainty(*each) >= DETERMINED for each in zip(case.laws, case.effects, spreads, strict=True))
 
 
-def _chosen(passing: Sequence[Case]) -> tuple[Case | None, list[Case]]:
-    """The case of the fewest numbers among those that explain the same as the best, and all of these. They are worth as
-    much, and as likely on parts left out: few errors make much likely, and of a law that removes nearly all the rest
-    counts.
+def _chosen(passing: Sequence[Case]) -> tuple[Case | None, list[Case], list[Case]]:
+    """The case of the fewest numbers among those that explain the same as the best; others of as few numbers among
+    these, and all that are worth as much and leave as much. What explains the same is worth as much, and as likely on
+    parts left out: few errors make much likely, and of a law that removes nearly all the rest counts.
     """
     if not passing:
-        return None, []
+        return None, [], []
     worths = [case.worth for case in passing]
     top = passing[int(np.argmax(worths))]
     errors = simulated.independent(top.of)
     nats = [0.5 * errors * math.log(case.left / top.left) for case in passing]  # likelihood that each loses to the best
     alike = [passing[i] for i in even(worths) if nats[i] < EQUIVALENT_NATS]
-    return min(alike, key=lambda case: (case.numbers, case.left)), alike
+    best = min(alike, key=lambda case: (case.numbers, case.left))
+    as_few = [case for case in alike if case is not best and case.numbers <= best.numbers]
+    rest = [case for case in (passing[i] for i in even(worths)) if EQUIVALENT * case.left <= top.left]
+    return best, as_few, [case for case in passing if any(case is other for other in (*alike, *rest))]

@@ -17,7 +17,7 @@ from .hypothesis import covariances
 from .keys import Key, key_of, listed, place_of, remainder_of, with_article, words
 from .outcome import Diagnosis
 from .shapes import Shape, shape
-from .verdict import RISEN
+from .verdict import EQUIVALENT, RISEN
 
 
 class Estimate(NamedTuple):
@@ -144,6 +144,7 @@ def verdict(
         return f"The training data support {names}, but on test data {stays} {numbers}: do not trust it."
     column, before, after = ratios[0]
     rising = [f"that of {c} rises from {b:.3g} to {a:.3g}" for c, b, a in ratios[1:] if a > b]
+    rising += _risen_before(error, judged)
     of = "error of a free simulation" if "judged_s" in error else f"{horizon} prediction error"
     falls = f"the {of} of {column} falls from {before:.3g} to {after:.3g}"
     return f"{text}; with {it} {listed([falls, *rising])} on test data."
@@ -175,6 +176,17 @@ def growth(error: Mapping[str, Any]) -> dict[str, float]:
     return {column: math.log(max(a, 1e-300) / max(b, 1e-300)) for column, (b, a) in _judged(error)[1].items()}
 
 
+def _risen_before(error: Mapping[str, Any], judged: float) -> list[str]:
+    """The column whose test error rises most at a shorter horizon [s], if by more than laws that explain the same
+    differ.
+    """
+    shorter = {horizon: _judged({**error, "judged_s": horizon})[1] for horizon in error["horizons_s"]}
+    every = [(a / max(b, 1e-300), h, c, b, a) for h, of in shorter.items() if h < judged for c, (b, a) in of.items()]
+    rise, horizon, column, before, after = max(every, default=(0.0, 0.0, "", 0.0, 0.0))
+    text = f"that of {column} at {horizon:.3g} s rises from {before:.3g} to {after:.3g}"
+    return [text] if rise**2 > 1 / EQUIVALENT else []
+
+
 def _judged(error: Mapping[str, Any]) -> tuple[float, dict[str, tuple[float, float]]]:
     """Horizon [s] and, by column, test errors there without and with the accepted effects, where both are known."""
     judged = error.get("judged_s", 1.0)
@@ -190,6 +202,14 @@ def _texts(parameters: Mapping[str, Estimate]) -> dict[str, str]:
 
 
 def _sized(finding: Finding) -> str:
+    """Name of a finding with its size, one of those that explain the same."""
+    if not finding.equivalent:
+        return _alone(finding)
+    *some, last = [_alone(finding), *(with_article(words(key)) for key in finding.equivalent)]
+    return f"one of {', '.join(some)} or {last}"
+
+
+def _alone(finding: Finding) -> str:
     """Name of a finding with its size: the first parameter, or the range of its function."""
     name, curve = with_article(words(key_of(finding.effect))), finding.curve
     sizes = _texts(finding.parameters)

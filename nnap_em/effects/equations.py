@@ -3,6 +3,7 @@
 Each is a `Flow`: one formula for all of them, so that a search compiles one program for all.
 """
 
+import dataclasses
 import itertools
 import math
 from collections.abc import Sequence
@@ -15,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from .actuator import InputEffect
 from .base import AbstractEffect, Candidate, Scalar, SearchScales, SensorEffect, a, known, one
 
 STRONG = 5.0
@@ -22,16 +24,21 @@ STRONG = 5.0
 the signal."""
 FORMS = (
     "", " in proportion to {0}", " in proportion to {0} - {1}", " in proportion to {0} {1}", " with the square of {0}",
-    "", " of {1}",
+    "", "", " with a power of {0}", " with the cube of {0}",
 )  # fmt: skip
 """Words of the forms of a flow, with the names of its signals."""
+
+
+POWERS = 0.2, 5.0
+"""Ends of the exponents of a power."""
 
 
 class Flow(AbstractEffect):
     """strength g(signals), which enters `source`, and times share `target`.
 
-    g is one of 1, p, p - q, p q, p |p|, p above a level (p - level), and q where p is above a level, by `kind`, of the
-    signals p and q that `first` and `second` pick of states and inputs.
+    g is one of 1, p, p - q, p q, p |p|, p above a level (p - level), the rate of the source where p is above a level
+    and rises, p |p|^(level - 1) and p^3, by `kind`, of the signals p and q that `first` and `second` pick of states and
+    inputs.
     """
 
     meaning: ClassVar[str] = "A flow."
@@ -50,8 +57,11 @@ class Flow(AbstractEffect):
         values = jnp.concatenate([scene.q, cast(Array, scene.u)])
         p, q = self.first @ values, self.second @ values
         over, edge = jnp.maximum(p - self.level, 0.0), jnp.maximum(self.edge, 1e-12)
-        step = q * jax.nn.sigmoid((p - self.level) / edge)
-        forms = jnp.stack([jnp.ones_like(p), p, p - q, p * q, p * jnp.abs(p), over, step])
+        step = jax.nn.sigmoid((p - self.level) / edge)
+        rates = jnp.stack(scene.system.slopes(scene.q, scene.v, scene.u, jnp.zeros_like(scene.drive)))
+        rising = jnp.maximum(jnp.abs(self.source[: len(rates)]) @ rates, 0.0)
+        power = jnp.sign(p) * jnp.maximum(jnp.abs(p), 1e-12) ** jnp.clip(self.level, *POWERS)
+        forms = jnp.stack([jnp.ones_like(p), p, p - q, p * q, p * jnp.abs(p), over, step * rising, power, p**3])
         return self.strength * (self.kind @ forms) * (self.source + self.share * self.target)
 
 
@@ -112,12 +122,13 @@ class PortEffect(SignalEffect):
     def units_on(self, system):
         signals = [system.unit(name) for name in self.reads]
         port = system.port_unit(system.ports.index(self.channel) + 1)
-        per = [[], signals[:1], signals[:1], signals[:2], signals[:1] * 2, signals[:1], signals[1:2]][self.kind]
+        one, of = signals[:1], signals[:1] and f"({signals[0]})^power"
+        per = [[], one, one, signals[:2], one * 2, one, [], [of] if of else [], one * 3][self.kind]
         per = [unit for unit in per if unit]
         strength = f"{port}/({' '.join(per)})" if len(per) > 1 else f"{port}/{per[0]}" if per else port
         if len(per) == 1 and port == f"{per[0]}/s":
             strength = "1/s"
-        return {"strength": strength, "level": signals[0] if signals else "", "share": "-"}
+        return {"strength": strength, "level": signals[0] if signals else "", "share": "-", "power": "-"}
 
     def phrase(self, sizes):
         out = "out of" if self.leaves else "into"
@@ -125,7 +136,8 @@ class PortEffect(SignalEffect):
         form = FORMS[self.kind].format(*self.reads)
         level = f" above {self.reads[0]} = {sizes['level']}" if "level" in sizes else ""
         share = f" (share {sizes['share']})" if "share" in sizes else f" ({sizes['strength']})"
-        return f"a flow {way}{form}{level}{share}"
+        power = f", power {sizes['power']}" if "power" in sizes else ""
+        return f"a flow {way}{form}{level}{share}{power}"
 
     def inputs_named(self):
         return (*self.reads, *([self.to] if self.to else []))
@@ -159,8 +171,9 @@ class PortEffect(SignalEffect):
         rate = float(around.torque[around.system.ports.index(port)])
         ends = [around.sizes[name] for name in of]
         width, reach = [high - low for low, high in ends], [max(abs(low), abs(high)) for low, high in ends]
-        typical = (1.0, *reach[:1], *width[:1], math.prod(reach), *[r * r for r in reach[:1]], *width[:1], *reach[1:2])
-        spread = STRONG * rate / max(typical[cls.kind] if of else 1.0, 1e-12)
+        first, high = [*reach, 1.0][0], [*width, 1.0][0]
+        typical = 1.0, first, high, math.prod(reach), first**2, high, 1.0, first**level, first**3
+        spread = STRONG * rate / max(typical[cls.kind], 1e-12)
 
         def make(strength: float, level: float, share: float):
             edge = 0.02 * width[0] if of else 0.0  # width of a step at a level, as a share of the range of its signal
@@ -169,7 +182,8 @@ class PortEffect(SignalEffect):
         has, none = cls.reports, 1e-12
         start = make(0.0, level, 0.7 if "share" in has else 1.0)
         probe = make(0.04 * spread, level, 0.7 if "share" in has else 1.0)
-        wide = make(spread, 0.3 * width[0] if "level" in has else none, 0.3 if "share" in has else none)
+        far = 0.3 * width[0] if "level" in has else 1.0 if "power" in has else none
+        wide = make(spread, far, 0.3 if "share" in has else none)
         return Candidate(start, (probe,), wide)
 
 
@@ -196,6 +210,36 @@ class SquareFlow(PortEffect):
     meaning: ClassVar[str] = "A state gains or loses with the square of a signal."
     confirm: ClassVar[str] = "Hold all else still, double this signal, and compare the rates of the state."
     kind: ClassVar[int] = 4
+
+
+class CubicFlow(PortEffect):
+    """strength p^3."""
+
+    meaning: ClassVar[str] = "A state gains or loses with the cube of a signal."
+    confirm: ClassVar[str] = "Hold all else still, double this signal, and compare the rates of the state."
+    kind: ClassVar[int] = 8
+
+
+class PowerFlow(PortEffect):
+    """strength p |p|^(power - 1)."""
+
+    meaning: ClassVar[str] = "A state gains or loses with a power of a signal."
+    confirm: ClassVar[str] = "Hold all else still, double this signal twice, and compare the rates of the state."
+    kind: ClassVar[int] = 7
+    reports: ClassVar[tuple[str, ...]] = ("strength", "power")
+
+    @property
+    def power(self) -> Scalar:
+        """The exponent, in the place of a level."""
+        return self.level
+
+    def is_physical(self):
+        return POWERS[0] < float(self.level) < POWERS[1]
+
+    @classmethod
+    def candidates(cls, around):
+        powers = 0.5, 1.5, 3.0  # at which the search for one begins
+        return [cls.at(around, *place, power) for place in cls.places(around) for power in powers]
 
 
 class ProductFlow(PortEffect):
@@ -243,18 +287,135 @@ class Transfer(PortEffect):
         return [(one, (one,), other) for one, other in around.ordered]
 
 
-class Overflow(PortEffect):
-    """strength u leaves the state p while it is above a level, and a share of it enters another."""
+class FullEffect(PortEffect):
+    """What flows into the state p, less what flows out, leaves it while it is above a level and rises."""
 
-    meaning: ClassVar[str] = "Above a level of a state its inflow goes elsewhere, a share of it into another state."
-    confirm: ClassVar[str] = "Fill the first state above the level and watch where the inflow goes."
     kind: ClassVar[int] = 6
     leaves: ClassVar[bool] = True
-    reports: ClassVar[tuple[str, ...]] = ("level", "share", "strength")
+    linear: ClassVar[bool] = False
+
+    @classmethod
+    def candidates(cls, around):
+        out = []
+        for port, of, to in cls.places(around):
+            low, high = around.sizes[of[0]]
+            width, shares = high - low, "share" in cls.reports
+            make = partial(cls, channel=port, reads=of, to=to, edge=0.02 * width)
+            start = make(strength=1.0, level=high + width, share=0.7)
+            wide = make(strength=1e-12, level=0.3 * width, share=0.3 if shares else 1e-12)
+            grid = (0.4, 0.6, 0.8, 0.95)  # places in the range of the state where the search for a level begins
+            levels = [dataclasses.replace(start, level=a(low + place * width)) for place in grid]
+            out += [Candidate(start, (probe,), wide) for probe in levels]
+        return out
+
+    def is_physical(self) -> bool:
+        return "share" not in self.reports or 0.0 < float(self.share) < 1.5
+
+
+class Ceiling(FullEffect):
+    """What flows into a state, less what flows out, is lost while it is above a level and rises."""
+
+    meaning: ClassVar[str] = "A state does not rise above a level: a vessel that is full, a stop, a clipped value."
+    confirm: ClassVar[str] = "Drive this state up slowly and watch where it stays."
+    reports: ClassVar[tuple[str, ...]] = ("level",)
 
     @classmethod
     def places(cls, around):
-        return [(one, (one, u), other) for one, other in around.ordered for u in around.inputs]
+        ports = [name for name in around.system.open_ports if name in around.sizes]
+        return [(name, (name,), None) for name in ports]
+
+    def phrase(self, sizes):
+        return f"a ceiling of {self.channel} at {sizes['level']}"
+
+
+class Overflow(FullEffect):
+    """What flows into a state, less what flows out, enters another, or a share, while it is above a level and rises."""
+
+    meaning: ClassVar[str] = "A state does not rise above a level: what flows over, or a share of it, enters another."
+    confirm: ClassVar[str] = "Fill the first state above the level and watch where the inflow goes."
+    reports: ClassVar[tuple[str, ...]] = ("level", "share")
+
+    @classmethod
+    def places(cls, around):
+        return [(one, (one,), other) for one, other in around.ordered]
+
+    def phrase(self, sizes):
+        return f"an overflow of {self.channel} into {self.to} above {sizes['level']} (share {sizes['share']})"
+
+
+class Varied(AbstractEffect):
+    """Parameters k of the plant, times 1 + slope (p - middle) where `which` is 1; p the signal that `pick` picks."""
+
+    meaning: ClassVar[str] = "A parameter that changes."
+    confirm: ClassVar[str] = "Change the signal alone."
+    slope: Scalar
+    which: Float[Array, " parameter"] = known()
+    pick: Float[Array, " signal"] = known()
+    middle: Any = known()
+
+    def force(self, scene, memory):
+        system, still = scene.system, jnp.zeros_like(scene.drive)
+        moved = self.slope * self.which * (self.pick @ jnp.concatenate([scene.q, cast(Array, scene.u)]) - self.middle)
+        numbers = zip(system.of.parameters, moved, strict=True)
+        changed = system.with_parameters({name: system.values[name] * (1 + more) for name, more in numbers})
+        rates = (jnp.stack(one.slopes(scene.q, scene.v, scene.u, still)) for one in (changed, system))
+        return still.at[: len(system.states)].set(next(rates) - next(rates))
+
+
+class VaryingParameter(SignalEffect):
+    """k (1 + slope (p - middle)) in the place of a parameter k, `middle` in the range of the signal p."""
+
+    meaning: ClassVar[str] = "A parameter is none: it changes with a signal, as a heat transfer with the flow."
+    confirm: ClassVar[str] = "Measure the parameter at two values of this signal."
+    slope: Scalar = eqx.field(kw_only=True, converter=a)
+    middle: Any = known(kw_only=True)
+
+    def lean(self, system):
+        which, pick = (
+            _one_of(system.of.parameters, self.channel),
+            _one_of((*system.states, *system.inputs), *self.reads),
+        )
+        return Varied(self.slope, which, pick, self.middle)
+
+    def with_numbers(self, lean):
+        return eqx.tree_at(lambda e: e.slope, self, cast(Varied, lean).slope)
+
+    def values(self):
+        return {"slope": self.slope}
+
+    def units_on(self, system):
+        unit = system.unit(self.reads[0])
+        return {"slope": f"1/({unit})" if unit else "-"}
+
+    def phrase(self, sizes):
+        return f"a {self.channel} that changes with {self.reads[0]} ({sizes['slope']} from {float(self.middle):.3g} on)"
+
+    @classmethod
+    def candidates(cls, around):
+        out = []
+        for signal, (low, high) in around.sizes.items():
+            for name in around.system.of.parameters:
+                make = partial(cls, middle=(low + high) / 2, channel=name, reads=(signal,))
+                start, probe, wide = (make(slope=slope * 2 / (high - low)) for slope in (0.0, 0.04, 1.0))
+                out.append(Candidate(start, (probe,), wide))
+        return out
+
+
+class InputBias(InputEffect):
+    """u + bias."""
+
+    meaning: ClassVar[str] = "The plant receives more or less of an input than is logged, by a constant."
+    confirm: ClassVar[str] = "Set this input to zero, measure what arrives, and compare with the log."
+    units: ClassVar[dict[str, str]] = {"bias": "N m"}
+    bias: Scalar
+
+    @classmethod
+    def candidates(cls, around):
+        places = [(place, size) for place, size in around.drives if "channel" in place]
+        return [one(partial(cls, **place), 0.0, 0.03 * size, 0.5 * size) for place, size in places]
+
+    def drive(self, torque):
+        return torque + self.bias
 
 
 class Bend(SensorEffect):

@@ -42,11 +42,14 @@ class Motion(NamedTuple):
     unstable: tuple[str, ...] = ()
     kept: tuple[str, ...] = ()
     """States that keep a change of their start: integrators."""
+    slope: Any = 0.0
+    """Root mean square of the slopes of the states themselves, over a twentieth of a recording [1/s]."""
 
     @property
     def size(self) -> Float[np.ndarray, " state"]:
-        """Root mean square of the rates, a thousandth of the largest at least."""
+        """Root mean square of the rates, by the equations or the states; a thousandth of the largest at least."""
         size = np.sqrt(np.mean(self.rate**2, axis=0)) if len(self.rate) else np.ones(self.x.shape[1])
+        size = np.maximum(size, self.slope)
         return np.maximum(size, 1e-3 * size.max() + 1e-12)
 
 
@@ -107,7 +110,10 @@ def motion(model: StateSpaceModel, data: Dataset) -> Motion:
     rows = np.sum(valid, axis=1)
     long = (rows >= np.median(rows)) & np.isfinite(path).all(axis=(1, 2))  # as long as half of the sequences are
     step = step[long, : int(np.median(rows)) - 1, :count, :count] * width / width[:, None]
-    return seen._replace(**_modes(model.system.states, step, model.dt))
+    lag = max(1, int(np.median(rows)) // 20)
+    change = np.where(valid[:, lag:, None], path[:, lag:, :count] - path[:, :-lag, :count], np.nan) / (lag * model.dt)
+    slope = np.ma.filled(np.ma.mean(np.ma.masked_invalid(change) ** 2, axis=(0, 1)), 0.0) ** 0.5
+    return seen._replace(slope=slope, **_modes(model.system.states, step, model.dt))
 
 
 def _modes(states: tuple[str, ...], step: Float[np.ndarray, "seq time state state"], dt: float) -> dict[str, Any]:
@@ -151,10 +157,11 @@ def _along(system: Equations, x: Float[np.ndarray, "row state"], u: Float[np.nda
 
 
 def pace_of(rig: Rig, seen: Motion, rows: int) -> float:
-    """The declared horizon, or eight slowest time constants, at most a third of a recording, or where equations are
-    unstable the time in which errors grow e-fold [s]; of two digits: programs are shared.
+    """The declared horizon, or eight slowest time constants, with integrators without end, a third of a recording at
+    most; where equations are unstable the time in which errors grow e-fold [s]; of two digits: programs are shared.
     """
-    pace = rig.horizon or min(8.0 * seen.slowest, rows * rig.dt / 3)
+    slowest = math.inf if seen.kept else seen.slowest
+    pace = rig.horizon or min(8.0 * slowest, rows * rig.dt / 3)
     if seen.growth and not rig.horizon:
         return float(f"{max(min(pace, 1 / seen.growth), 4 * rig.dt):.2g}")
     return float(f"{max(pace, 8 * rig.dt):.2g}")

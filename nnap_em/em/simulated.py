@@ -175,9 +175,14 @@ def independent(of: Simulated) -> float:
     return float(of.observed.sum()) / total
 
 
+def costs(error: Errors, scale: Scale, counts: Counts) -> Errors:
+    """Squared errors in scales; linear beyond `HUBER`, those that are no number as `FARTHEST`; 0 that do not count."""
+    return np.where(counts, huber(np.where(np.isfinite(error), error, np.inf), scale, HUBER), 0.0)
+
+
 def cost(error: Errors, scale: Scale, counts: Counts) -> float:
-    """Squared errors in scales; linear beyond `HUBER`, those that are no number as `FARTHEST`."""
-    return float(np.sum(np.where(counts, huber(np.where(np.isfinite(error), error, np.inf), scale, HUBER), 0.0)))
+    """Sum of `costs`."""
+    return float(np.sum(costs(error, scale, counts)))
 
 
 def log_posterior(of: Simulated, scale: Scale, counts: Counts) -> float:

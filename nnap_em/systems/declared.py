@@ -5,7 +5,7 @@ from functools import partial
 
 from ..data.rig import Declaration, SystemSpec, every, nearest
 from ..data.servo import Inputs
-from ..data.table import Table
+from ..data.table import Declared, Table
 from .equations import Text
 from .expression import FUNCTIONS, Formula, FormulaError, parse
 
@@ -19,7 +19,7 @@ def declare(root: Table, of: Text | None = None) -> Declaration:
     units = model.table("units", absent={})
     units = {name: _unit(units, name) for name in units.items}
     states, inputs = _named(model, "states", own.states), _named(model, "inputs", own.inputs)
-    reserved = ("type", "inputs", "states", "rates", "unknown", "units")
+    reserved = ("type", "inputs", "states", "rates", "unknown", "units", "exact", "open")
     parameters = {key: model.quantity(key) for key in model.items if key not in reserved}
     unknown = model.table("unknown", absent={})
     _distinct(model, states, inputs, parameters, unknown.items)
@@ -29,7 +29,7 @@ def declare(root: Table, of: Text | None = None) -> Declaration:
     rates = {} if of is not None else _rates(model, states, known)
     readings = _readings(root.table("measurement"), states, known)
     if of is not None:
-        model.check(("type", *of.parameters), ("units", "unknown"))
+        model.check(("type", *of.parameters), ("units", "unknown", "exact", "open"))
     else:
         formulas = (*rates.values(), *readings.values())
         _used(model, formulas, {**parameters, **inputs})
@@ -45,9 +45,32 @@ def declare(root: Table, of: Text | None = None) -> Declaration:
         {name: (port, signals) for name, (port, signals) in terms.items() if port},
         {**own.units, **inherited, **units},
         own.function,
+        _exact(model, states, rates, parameters, (*named, *(port for port, _ in terms.values()))),
     )
     spec = SystemSpec(tuple(states), tuple(parameters), {}, 0, sensors=tuple(readings))
     return Declaration(spec, parameters, Inputs(tuple(inputs), tuple(range(1, len(inputs) + 1))), equations=text.packed)
+
+
+def _exact(
+    model: Table,
+    states: Collection[str],
+    rates: Mapping[str, Formula],
+    parameters: Mapping[str, Declared],
+    unknown: Collection[str],
+) -> tuple[str, ...]:
+    """States in whose rate nothing can be missing: those of `exact`, and where a formula holds no estimated number, as
+    y' = v and x' = v cos(psi) do; but for those of `open`, and where it is a constant. Where all numbers are trusted, a
+    trusted one counts as estimated.
+    """
+    exact, open_ = (model.distinct(key, str) if key in model.items else () for key in ("exact", "open"))
+    for key, name in [("exact", name) for name in exact] + [("open", name) for name in open_]:
+        if name not in states:
+            model.refuse(key, f"{name!r} is no state", nearest(name, states))
+    estimated = {name for name, number in parameters.items() if number.std}
+    held = [set(parameters) & set(rate.names) for rate in rates.values()]
+    known = estimated if any(estimated & names for names in held) else set(parameters)
+    shut = [name for name, rate in rates.items() if rate.names and not {*known, *unknown} & {name, *rate.names}]
+    return tuple(name for name in dict.fromkeys((*exact, *shut)) if name not in open_)
 
 
 def _named(model: Table, key: str, had: Mapping[str, str]) -> dict[str, str]:

@@ -29,6 +29,7 @@ class Text(NamedTuple):
     """Unknown terms that are added to the rate of a state: the state, and their signals."""
     units: Mapping[str, str] = {}  # Units of parameters and readings, as far as they are declared
     function: str = ""  # Name of the Python function
+    exact: tuple[str, ...] = ()  # States whose rate lacks nothing: definitions, as of a velocity
 
     @property
     def packed(self) -> str:
@@ -45,7 +46,8 @@ def unpacked(text: str) -> Text:
     entries = json.loads(text)
     terms = {name: tuple(signals) for name, signals in entries["terms"].items()}
     enters = {name: (state, tuple(signals)) for name, (state, signals) in entries["enters"].items()}
-    return Text(**(entries | {"parameters": tuple(entries["parameters"]), "terms": terms, "enters": enters}))
+    lists = {name: tuple(entries.get(name, ())) for name in ("parameters", "exact")}
+    return Text(**(entries | lists | {"terms": terms, "enters": enters}))
 
 
 @functools.cache
@@ -94,7 +96,7 @@ class Equations(AbstractPlant):
 
     @property
     def open_ports(self) -> tuple[str, ...]:
-        return self.ports
+        return tuple(port for port in self.ports if port not in self.of.exact)
 
     @property
     def sensors(self) -> dict[str, str]:

@@ -19,7 +19,7 @@ from nnap_em.diagnosis.equations import FOLDS, Case, by_simulation, folds
 from nnap_em.diagnosis.hypothesis import Evidence, declared
 from nnap_em.diagnosis.search import Progress, search
 from nnap_em.effects import Candidate, OperatingPoint, SensorEffect, catalogue
-from nnap_em.effects.equations import UnknownTerm
+from nnap_em.effects.equations import UnknownTerm, lean, numbered
 from nnap_em.em.equations import free_term, motion
 from nnap_em.em.prior import ParameterPrior
 from nnap_em.em.simulated import Simulated, Windows
@@ -66,6 +66,26 @@ def test_a_law_pushes_as_its_formula_says():
         np.testing.assert_allclose(_pushes(law), expected, rtol=1e-12, err_msg=name)
         below = dataclasses.replace(law, level=jnp.asarray(2.5))
         assert np.abs(_pushes(below)).max() < 1e-100 or "level" not in law.reports
+
+
+def test_laws_of_inputs_and_readings_are_the_same_in_the_form_of_all():
+    """Gain, bias, dead zone and limit of u beside each other; scale, bias and bend of b; other places stay."""
+    system = Equations({"k": jnp.ones(())}, json.dumps(PLANT))
+    laws = [catalogue[name].of(0.4, channel="u") for name in ("motor_gain", "input_bias", "dead_zone", "saturation")]
+    laws += [catalogue[name].of(0.4, channel="b") for name in ("sensor_scale", "sensor_bias")]
+    laws.append(catalogue["sensor_bend"].of(0.4, 2.0, channel="b", range=4.0))
+    for law in laws:
+        form = lean(law, system)
+        for value in (-1.7, 0.1, 3.0):
+            if law.channel == "u":
+                assert form.at_drive({"channel": "u"}, 0).drive(jnp.asarray(value)) == pytest.approx(law.drive(value))
+            else:
+                for index, expected in ((0, value), (1, law.reading(value, None))):
+                    read = form.at_reading("", index).reading(jnp.asarray(value), None)
+                    assert read == pytest.approx(float(expected))
+        np.testing.assert_array_equal(_pushes(form), [0.0, 0.0])
+        moved = dataclasses.replace(form, strength=jnp.asarray(0.7))
+        assert float(next(iter(jax.tree.leaves(numbered(law, moved))))) == pytest.approx(0.7)
 
 
 def test_a_parameter_that_varies_pushes_as_the_equations_with_another_one():
@@ -157,6 +177,27 @@ def test_laws_that_make_a_reading_worse_at_some_age_are_refused():
         assert equations.worsens(before, after) == worse
 
 
+def test_each_law_of_a_pair_is_tried_in_the_place_of_the_other():
+    """Of the pair a, c other laws take the place of either; those that explain nine tenths of what it does are told."""
+    system = Equations({}, json.dumps(PLANT))
+    names, key = ("linear_flow", "square_flow", "cubic_flow"), equations.key_of
+    flows = [catalogue[name](strength=0.0, channel="a", reads=("a",)) for name in names]
+    laws = [Candidate(law, (), law) for law in (*flows, catalogue["motor_gain"].of(0.0, channel="u"))]
+    left = {(0, 3): 40.0, (1, 3): 45.0, (2, 3): 47.0, (0, 1): 60.0, (0, 2): 40.0}
+    cost = {frozenset(key(laws[i].start) for i in pair): cost for pair, cost in left.items()}
+
+    def fitted(*some: Candidate) -> Case:
+        left = cost.get(frozenset(key(law.start) for law in some), 90.0)
+        model = SimpleNamespace(effects=tuple(lean(law.start, system) for law in some))
+        return Case(some, _case(1.0, 1, 0.5).of._replace(model=model, z=np.array([left])), left)
+
+    cases = [fitted(law) for law in laws[:3]]
+    fit = lambda bare, every, steps: {i: fitted(*some) for i, (some, _) in enumerate(every)}  # noqa: E731
+    search = SimpleNamespace(fit=fit, loss=lambda of: float(of.z[0]))
+    rivals = equations._rivals(search, None, fitted(laws[0], laws[3]), cases, 100.0)  # type: ignore[arg-type]
+    assert [case.loss for case in rivals] == [40.0, 45.0]  # explained: 60, 55 and, too little, 53 and 40 of 60
+
+
 def test_what_is_as_good_in_the_place_of_a_law_is_told():
     one, two, three = (catalogue[name] for name in ("linear_flow", "square_flow", "motor_gain"))
     a, b = (kind(strength=0.0, channel="a", reads=("a",)) for kind in (one, two))
@@ -173,9 +214,9 @@ def test_the_common_form_of_a_free_function_is_the_same_function():
     system = Equations({}, json.dumps(PLANT))
     basis = np.random.default_rng(0).standard_normal((7, 25))
     term = UnknownTerm(jnp.arange(7.0), basis, np.zeros(2), np.full(2, 4.0), channel="b", reads=("b", "u"))
-    lean = term.lean(system)
-    np.testing.assert_allclose(_pushes(lean), _pushes(term), rtol=1e-12)
-    np.testing.assert_array_equal(term.with_numbers(lean).weights, term.weights)
+    form = term.lean(system)
+    np.testing.assert_allclose(_pushes(form), _pushes(term), rtol=1e-12)
+    np.testing.assert_array_equal(term.with_numbers(form).weights, term.weights)
 
 
 def test_the_table_of_an_unknown_term_has_its_values_and_their_spread():

@@ -13,12 +13,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Bool, Float
 
 from ..data.dataset import Dataset
-from ..effects import AbstractEffect, Candidate, SearchScales, SensorEffect, catalogue, flat
-from ..effects.actuator import DriveEffect
-from ..effects.equations import STRONG, SignalEffect
+from ..effects import AbstractEffect, Candidate, SearchScales, SensorEffect, catalogue, fields, flat
+from ..effects.actuator import DriveEffect, MotorGain
+from ..effects.equations import STRONG, InputBias, SignalEffect, lean, numbered
 from ..em import simulated
 from ..em.equations import free_term, motion
 from ..em.readings import reading_noise
@@ -26,7 +27,7 @@ from ..fit.identify import Identified, fitted_to_horizon
 from ..model.state_space import with_effects
 from ..storage.deadline import TimeUp, late
 from ..storage.log import Log
-from .hypothesis import Evidence, Hypothesis, covariances
+from .hypothesis import Addition, Evidence, Hypothesis, covariances
 from .keys import Key, complexity, key_of, words
 from .outcome import Step, Suspect
 from .search import Method, Round
@@ -65,7 +66,7 @@ class Case(NamedTuple):
     def effects(self) -> tuple[AbstractEffect, ...]:
         """The laws with their numbers."""
         fitted = self.of.model.effects[len(self.of.model.effects) - len(self.laws) :]
-        return tuple(law.start.with_numbers(effect) for law, effect in zip(self.laws, fitted, strict=True))
+        return tuple(numbered(law.start, effect) for law, effect in zip(self.laws, fitted, strict=True))
 
     @property
     def worth(self) -> float:
@@ -112,8 +113,8 @@ class Search(NamedTuple):
         system = hypothesis.model.system
         for law, start in zip(laws, starts, strict=True):
             none = law.start if law.start.linear else start
-            lean = Candidate(none.lean(system), (), law.prior_std.lean(system))
-            hypothesis = hypothesis.plus(start.lean(system), lean)
+            law = Candidate(lean(none, system), (), lean(law.prior_std, system))
+            hypothesis = hypothesis.plus(lean(start, system), law)
         return hypothesis
 
     def fit(
@@ -268,13 +269,21 @@ def _prepared(search: Search, hypothesis: Hypothesis) -> tuple[Search, Hypothesi
     have in a fit, and that fitted.
     """
     system = hypothesis.model.system
-    effects = tuple(effect.lean(system) for effect in hypothesis.model.effects)
-    lean = hypothesis.refitted(with_effects(hypothesis.model, effects))
-    begin = simulated.filtered(lean.model, search.data)
-    first = simulated.simulated(lean.model, lean.m_step.prior, search.data, begin)
+    bare = hypothesis.having(tuple(_lean(one, system) for one in hypothesis.additions))
+    begin = simulated.filtered(bare.model, search.data)
+    first = simulated.simulated(bare.model, bare.m_step.prior, search.data, begin)
     search = search._replace(begin=begin, scale=simulated.scale_of(first))
-    null = search.fit(lean, [((), ())]).get(0)
-    return search._replace(scale=simulated.scale_of(null.of)) if null else search, lean, null
+    null = search.fit(bare, [((), ())]).get(0)
+    return search._replace(scale=simulated.scale_of(null.of)) if null else search, bare, null
+
+
+def _lean(addition: Addition, system: Any) -> Addition:
+    """An addition without what laws need not have in a fit."""
+    law, names = addition.effect, fields(addition.effect)
+    numbers = lambda effect: [getattr(effect, name) for name in names]  # noqa: E731
+    unflat = ravel_pytree(numbers(law))[1]
+    mean, std = (lean(eqx.tree_at(numbers, law, unflat(values)), system) for values in (addition.mean, addition.std))
+    return Addition(lean(law, system), flat(mean), flat(std), addition.evidence)
 
 
 def _lost(search: Search, hypothesis: Hypothesis) -> list[float]:
@@ -283,12 +292,12 @@ def _lost(search: Search, hypothesis: Hypothesis) -> list[float]:
     laws = [i for i, evidence in enumerate(hypothesis.evidence) if evidence is not None]
     if len(laws) < 2:  # of one law the round has just said so
         return shares
-    search, lean, full = _prepared(search, hypothesis)
+    search, bare, full = _prepared(search, hypothesis)
     nothing = np.full((1, 2, 1), math.nan)
     left = lambda one, case: search.left_out(one, [case] if case else []).get(0, nothing)[:, 1:].sum()  # noqa: E731
-    whole = left(lean, full)
+    whole = left(bare, full)
     for i in laws:
-        one = lean.without(i)
+        one = bare.without(i)
         share = 1 - whole / left(one, search.fit(one, [((), ())]).get(0))
         shares[i] = share if math.isfinite(share) else shares[i]
     return shares
@@ -300,32 +309,38 @@ def _round(search: Search, hypothesis: Hypothesis, rows: int) -> Round:
     """
     present = {key_of(effect) for effect in hypothesis.model.effects}
     fresh = lambda c: key_of(c.start) not in present  # noqa: E731
-    search, lean, null = _prepared(search, hypothesis)
+    search, bare, null = _prepared(search, hypothesis)
     nothing = Round(Step(rows, (), (), None, MEASURE), complete=not late())
     if null is None:
         return nothing
-    if not (parts := search.left_out(lean, [null])):
+    if not (parts := search.left_out(bare, [null])):
         return nothing
     some, whole, room = [*filter(fresh, search.every)], search.loss(null.of), search.room(null.of)
     search.log(f"{len(some)} candidates; {max(room, 0.0):.0%} of the squared error is not noise of the readings")
     if room < MULTI_STEP:
         return nothing
-    singles = search.screened(lean, some)
+    singles = search.screened(bare, some)
     short = []
     for numbers in range(1, 4):
         sound = [case for case in singles if case.numbers == numbers and case.sound]
         gains = [1 - search.loss(case.of) / whole for case in sound]
         ties = len(even(gains)) if sound else 0  # as good as the best: the logs may not discriminate them
         short += sound[: min(max(SHORTLIST, ties), 2 * SHORTLIST)]
-    judged = search.judged(lean, short, parts[0])
+    short += [case for case in _first(singles) if case.sound and not any(case is other for other in short)]
+    judged = search.judged(bare, short, parts[0])
     passing, tried = [case for case in judged if _passes(case)], [*judged]
     if room > max([MULTI_STEP, *(case.share for case in passing)]) / NAMED:  # else no pair, no function could be chosen
         both = itertools.combinations(singles[:PARTNERS], 2)
         joined = [((*a.laws, *b.laws), (*a.effects, *b.effects)) for a, b in both]
-        pairs = sorted(search.fit(lean, joined, steps=SCREEN_STEPS).values(), key=lambda case: case.loss)
-        functions = search.screened(lean, [*filter(fresh, search.free)])
+        pairs = sorted(search.fit(bare, joined, steps=SCREEN_STEPS).values(), key=lambda case: case.loss)
+        functions = search.screened(bare, [*filter(fresh, search.free)])
         best = [*[case for case in pairs if case.sound][:PAIRS_JUDGED], *functions[:FREE]]
-        tried += search.judged(lean, best, parts[0])
+        tried += search.judged(bare, best, parts[0])
+        passing = [case for case in tried if _passes(case)]
+    if passing:
+        rivals = _rivals(search, bare, _chosen(passing)[0], singles, whole)
+        unseen = [case for case in rivals if all(set(case.keys) != set(other.keys) for other in tried)]
+        tried += search.judged(bare, unseen[:PAIRS_JUDGED], parts[0])
         passing = [case for case in tried if _passes(case)]
     for case in tried:
         values = ["; ".join(f"{n} {float(v):.3g}" for n, v in effect.values().items()) for effect in case.effects]
@@ -333,12 +348,12 @@ def _round(search: Search, hypothesis: Hypothesis, rows: int) -> Round:
         search.log(f"  {laws}: {case.share:.0%} of the squared error on parts left out")
     listed = tuple((case.keys[0], 1 - search.loss(case.of) / whole) for case in singles)
     step = Step(rows, listed, tuple((case.keys[-1], case.share) for case in tried), None, MEASURE)
-    best, alike, tied = _chosen(passing)
     complete = not late()
-    if best is None:
+    if not passing:
         near = sorted((c for c in judged if suspected(c.share, MULTI_STEP) and c.sound), key=lambda c: -c.share)
         suspects = tuple(Suspect(case.keys[0], case.share, math.nan) for case in near[:4])
         return Round(step._replace(suspects=suspects), complete=complete)
+    best, alike, tied = _chosen(passing)
     if rivals := [case for case in alike if len(case.laws) == 1 and case.places.isdisjoint(best.places)]:
         keys = tuple(key for case in (best, *rivals) for key in case.keys)
         search.log(f"  cannot tell: {', '.join(map(words, keys))} explain the same; none is added")
@@ -349,9 +364,27 @@ def _round(search: Search, hypothesis: Hypothesis, rows: int) -> Round:
         hypothesis = hypothesis.plus(effect, law, record)
         search.log(f"  added {words(key_of(effect))}")
     fitted, effects = best.of.model, hypothesis.model.effects
-    effects = tuple(effect.with_numbers(of) for effect, of in zip(effects, fitted.effects, strict=True))
+    effects = tuple(numbered(effect, of) for effect, of in zip(effects, fitted.effects, strict=True))
     model = eqx.tree_at(lambda m: m.system, with_effects(hypothesis.model, effects), fitted.system)
     return Round(step._replace(accepted=best.keys[0]), hypothesis.refitted(model), complete)
+
+
+def _first(singles: Sequence[Case]) -> list[Case]:
+    """Gains and biases of inputs, which are judged whatever they explain."""
+    return [case for case in singles if isinstance(case.laws[0].start, MotorGain | InputBias)]
+
+
+def _rivals(search: Search, bare: Hypothesis, best: Case, singles: Sequence[Case], whole: float) -> list[Case]:
+    """Laws of `best` with another one in the place of each that explain as much of the error `whole`, best first."""
+    others = {id(case): case for case in (*singles[:PARTNERS], *_first(singles))}.values()
+    sets = []
+    for i in range(len(best.laws)):
+        laws, effects = tuple(a[:i] + a[i + 1 :] for a in (best.laws, best.effects))
+        fresh = [case for case in others if case.keys[0] not in best.keys]
+        sets += [((*laws, *case.laws), (*effects, *case.effects)) for case in fresh]
+    fits = sorted(search.fit(bare, sets, steps=SCREEN_STEPS).values(), key=lambda case: case.loss)
+    explained = lambda case: 1 - search.loss(case.of) / whole  # noqa: E731
+    return [case for case in fits if case.sound and explained(case) >= EQUIVALENT * explained(best)]
 
 
 def _in_place_of(key: Key, best: Case, tied: Sequence[Case]) -> tuple[Key, ...]:
@@ -375,13 +408,11 @@ def _certain(case: Case) -> bool:
     return all(certainty(*each) >= DETERMINED for each in zip(case.laws, case.effects, spreads, strict=True))
 
 
-def _chosen(passing: Sequence[Case]) -> tuple[Case | None, list[Case], list[Case]]:
+def _chosen(passing: Sequence[Case]) -> tuple[Case, list[Case], list[Case]]:
     """The case of the fewest numbers among those that explain the same as the best; others of as few numbers among
     these, and all that are worth as much and leave as much. What explains the same is worth as much, and as likely on
     parts left out: few errors make much likely, and of a law that removes nearly all the rest counts.
     """
-    if not passing:
-        return None, [], []
     worths = [case.worth for case in passing]
     top = passing[int(np.argmax(worths))]
     errors = simulated.independent(top.of)

@@ -261,6 +261,14 @@ class AbstractEffect(eqx.Module):
         """The law with the numbers of its `lean` form."""
         return lean
 
+    def at_drive(self, place: Mapping[str, Any], index: int) -> "AbstractEffect | None":
+        """The law as it is at one drive; None where it does nothing."""
+        return self if all(getattr(self, key) == value for key, value in place.items()) else None
+
+    def at_reading(self, name: str, index: int) -> "AbstractEffect | None":
+        """The law as it is for one reading; None where it does nothing."""
+        return self if self.channel in (name, "all") else None
+
     def curve(self, cov: Float[np.ndarray, "param param"], system: Any) -> Curve | None:
         """A learned function of one signal, its parameters of covariance `cov`; None for a law given by numbers."""
         return None

@@ -16,8 +16,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .actuator import InputEffect
-from .base import AbstractEffect, Candidate, Scalar, SearchScales, SensorEffect, a, known, one
+from .actuator import DeadZone, InputEffect, MotorGain, Saturation
+from .base import AbstractEffect, Candidate, Scalar, SearchScales, SensorEffect, a, fields, known, one
+from .sensor import SensorBias, SensorScale
 
 STRONG = 5.0
 """Prior standard deviation of a strength: multiple of that which moves a state by its typical rate over the range of
@@ -28,24 +29,27 @@ FORMS = (
 )  # fmt: skip
 """Words of the forms of a flow, with the names of its signals."""
 
-
 POWERS = 0.2, 5.0
 """Ends of the exponents of a power."""
 
 
-class Flow(AbstractEffect):
-    """strength g(signals), which enters `source`, and times share `target`.
+class PlantLaw(AbstractEffect):
+    """Any law of equations that takes no time, by zeros and ones: strength g(signals), which enters `source`, and times
+    share `target`; for inputs, `strength` as excess of a gain, bias, dead zone or limit; for readings, as excess of a
+    scale, bias or bend.
 
     g is one of 1, p, p - q, p q, p |p|, p above a level (p - level), the rate of the source where p is above a level
     and rises, p |p|^(level - 1) and p^3, by `kind`, of the signals p and q that `first` and `second` pick of states and
     inputs.
     """
 
-    meaning: ClassVar[str] = "A flow."
+    meaning: ClassVar[str] = "A law of equations."
     confirm: ClassVar[str] = "Change one signal of it at a time."
     strength: Scalar
     level: Scalar
     share: Scalar
+    inputs: Float[Array, "4 *input"] = known()
+    sensors: Float[Array, "3 *readable"] = known()
     kind: Float[Array, " kind"] = known()
     first: Float[Array, " signal"] = known()
     second: Float[Array, " signal"] = known()
@@ -63,6 +67,48 @@ class Flow(AbstractEffect):
         power = jnp.sign(p) * jnp.maximum(jnp.abs(p), 1e-12) ** jnp.clip(self.level, *POWERS)
         forms = jnp.stack([jnp.ones_like(p), p, p - q, p * q, p * jnp.abs(p), over, step * rising, power, p**3])
         return self.strength * (self.kind @ forms) * (self.source + self.share * self.target)
+
+    def at_drive(self, place, index):
+        return dataclasses.replace(self, inputs=self.inputs[:, index])
+
+    def drive(self, torque):
+        gain, bias, zone, limit = self.inputs
+        width, end = zone * self.strength, limit * self.strength + (1 - limit) * 1e30
+        value = (1 + gain * self.strength) * torque + bias * self.strength
+        return jnp.clip(value - jnp.clip(value, -width, width), -end, end)
+
+    def at_reading(self, name, index):
+        return dataclasses.replace(self, sensors=self.sensors[:, index])
+
+    def reading(self, value, past):
+        scale, bias, bend = self.strength * self.sensors
+        return (1 + scale) * value + bias + bend * (value - self.level) ** 2 / jnp.where(self.edge > 0, self.edge, 1.0)
+
+
+def lean(effect: AbstractEffect, system: Any) -> AbstractEffect:
+    """A law as a `PlantLaw`, so that one program serves all; itself where it takes time or has a form of its own."""
+    if type(effect) not in AT_ONCE:
+        return effect.lean(system)
+    at, place = AT_ONCE[type(effect)]
+    (strength, *inner), none = (getattr(effect, name) for name in fields(effect)), a(1e-12)
+    level, edge = (*inner, none)[0], getattr(effect, "range", a(0.0))
+    inputs, sensors = jnp.zeros((4, len(system.inputs))), jnp.zeros((3, len(system.readable)))
+    if at == "inputs":
+        inputs = inputs.at[place].set(_one_of(system.inputs, effect.channel))
+    else:
+        sensors = sensors.at[place].set(_one_of(system.readable, effect.channel))
+    signals, ports = jnp.zeros(len(system.states) + len(system.inputs)), jnp.zeros(len(system.ports))
+    kind = jnp.zeros(len(FORMS))
+    return PlantLaw(strength, level, none, inputs, sensors, kind, signals, signals, ports, ports, edge)
+
+
+def numbered(effect: AbstractEffect, lean: AbstractEffect) -> AbstractEffect:
+    """A law with the numbers of its lean form."""
+    if type(effect) not in AT_ONCE:
+        return effect.with_numbers(lean)
+    numbers, names = cast(PlantLaw, lean), fields(effect)
+    values = numbers.strength, numbers.level
+    return eqx.tree_at(lambda e: [getattr(e, name) for name in names], effect, list(values[: len(names)]))
 
 
 def _one_of(names: Sequence[str], name: str | None) -> Float[Array, " name"]:
@@ -90,7 +136,7 @@ class PortEffect(SignalEffect):
     """A law of some signals at a port, or from one to another."""
 
     kind: ClassVar[int]
-    """Its place among the forms of `Flow`."""
+    """Its place among the forms of `PlantLaw`."""
     leaves: ClassVar[bool] = False
     """True where it leaves its port."""
     reports: ClassVar[tuple[str, ...]] = ("strength",)
@@ -105,12 +151,14 @@ class PortEffect(SignalEffect):
     share: Scalar = eqx.field(kw_only=True, default=1.0, converter=a)
     edge: Any = known(kw_only=True, default=0.0)
 
-    def lean(self, system) -> Flow:
+    def lean(self, system) -> PlantLaw:
         signals, ports, way = (*system.states, *system.inputs), system.ports, -1.0 if self.leaves else 1.0
         first, second = (_one_of(signals, (*self.reads, None, None)[i]) for i in (0, 1))
         source, target = way * _one_of(ports, self.channel), -way * _one_of(ports, self.to)
         kind = np.eye(len(FORMS))[self.kind]
-        return Flow(self.strength, self.level, self.share, kind, first, second, source, target, self.edge)
+        inputs, sensors = jnp.zeros((4, len(system.inputs))), jnp.zeros((3, len(system.readable)))
+        law = partial(PlantLaw, self.strength, self.level, self.share, inputs, sensors)
+        return law(kind, first, second, source, target, self.edge)
 
     def with_numbers(self, lean):
         numbers = lambda e: (e.strength, e.level, e.share)  # noqa: E731
@@ -525,3 +573,10 @@ class UnknownTerm(SignalEffect):
 
     def phrase(self, sizes):
         return f"a flow into {self.channel} that depends on {' and '.join(self.reads)}"
+
+
+AT_ONCE: dict[type[AbstractEffect], tuple[str, int]] = {
+    MotorGain: ("inputs", 0), InputBias: ("inputs", 1), DeadZone: ("inputs", 2), Saturation: ("inputs", 3),
+    SensorScale: ("sensors", 0), SensorBias: ("sensors", 1), Bend: ("sensors", 2),
+}  # fmt: skip
+"""Laws of inputs and readings that take no time: their places in a `PlantLaw`."""

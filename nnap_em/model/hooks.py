@@ -95,9 +95,9 @@ def late(
     for i, place in enumerate(system.drives):
         column, stood = u[..., i], servos[i].feeds_back if servos else "channel" in place
         for effect in effects:
-            if all(getattr(effect, key) == value for key, value in place.items()):
-                column = through(effect, column, stood)
-                column = column if servos else effect.drive(column)
+            if (here := effect.at_drive(place, i)) is not None:
+                column = through(here, column, stood)
+                column = column if servos else here.drive(column)
         columns.append(column)
     return jnp.stack(columns, axis=-1) if columns else u
 
@@ -212,8 +212,8 @@ def read(
     """Readings of sensors on `values`; `past(delay)` are the values some seconds ago."""
     for effect in effects:
         for i, name in enumerate(names):
-            if effect.channel in (name, "all"):
-                values = values.at[i].set(effect.reading(values[i], lambda delay, i=i: past(delay)[i]))
+            if (here := effect.at_reading(name, i)) is not None:
+                values = values.at[i].set(here.reading(values[i], lambda delay, i=i: past(delay)[i]))
     return values
 
 

@@ -88,6 +88,20 @@ def test_laws_of_inputs_and_readings_are_the_same_in_the_form_of_all():
         assert float(next(iter(jax.tree.leaves(numbered(law, moved))))) == pytest.approx(0.7)
 
 
+def test_laws_of_time_are_the_same_in_the_form_of_all():
+    """Delay and lag of u, delays of b and of all readings; `past` returns its delay here."""
+    system, u = Equations({"k": jnp.ones(())}, json.dumps(PLANT)), jnp.asarray([0.0, 1.0, 3.0, 2.0, 2.0, -1.0])
+    for name in ("input_delay", "actuator_lag"):
+        law = catalogue[name].of(0.7, channel="u")
+        late = lean(law, system).at_drive({"channel": "u"}, 0).input(u, 0.5)
+        np.testing.assert_allclose(late, law.input(u, 0.5), rtol=1e-12)
+        assert lean(law, system).at_reading("b", 1).reading(None, float) == 0.0
+    for channel, delays in (("b", [0.0, 0.7]), ("all", [0.7, 0.7])):
+        form = lean(catalogue["sensor_delay"].of(0.7, channel=channel), system)
+        assert [form.at_reading("", i).reading(None, float) for i in (0, 1)] == pytest.approx(delays)
+        np.testing.assert_allclose(form.at_drive({}, 0).input(u, 0.5), u, atol=1e-12)
+
+
 def test_a_parameter_that_varies_pushes_as_the_equations_with_another_one():
     law = catalogue["varying_parameter"](slope=0.3, middle=1.0, channel="k", reads=("u",))  # k = 1 + 0.3 (3 - 1)
     np.testing.assert_allclose(_pushes(law), [0.0, 0.6 * 2.0], rtol=1e-12)

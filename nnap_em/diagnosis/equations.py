@@ -6,7 +6,7 @@ recordings, and judged on these. A linear screen along smoothed paths would favo
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple, cast
 
 import equinox as eqx
@@ -44,8 +44,8 @@ GROWN = 64.0
 """Pace over which sizes of delays and lags are grown: an eighth of a slowest time constant."""
 Cells = Float[np.ndarray, "*part age obs"]
 """Squared errors, of starts that are not settled first."""
-SCREEN_STEPS, JUDGED_STEPS = 30, 30
-"""Steps of a fit in a screen, and of one that is judged."""
+FIRST_STEPS, SCREEN_STEPS, JUDGED_STEPS = 8, 30, 30
+"""Steps of a fit of any pair, of one in a screen, and of one that is judged."""
 
 
 class Case(NamedTuple):
@@ -127,7 +127,9 @@ class Search(NamedTuple):
         """The hypothesis with each of some sets of laws, and the numbers that these begin with, fitted, by their place;
         from the models `begun`, if there are any. What cannot be fitted, or not in time, is left out.
         """
-        full = [self.with_laws(hypothesis, laws, starts) for laws, starts in every]
+        form = lambda pair: type(lean(pair[0].start, hypothesis.model.system)).__name__  # noqa: E731
+        ordered = [sorted(zip(*one, strict=True), key=form) for one in every]
+        full = [self.with_laws(hypothesis, [law for law, _ in one], [start for _, start in one]) for one in ordered]
         full = [one.refitted(model) for one, model in zip(full, begun, strict=True)] if begun else full
         groups: dict[Any, list[int]] = {}
         for i, one in enumerate(full):
@@ -143,7 +145,7 @@ class Search(NamedTuple):
                 continue
             for i, of in zip(places, fits, strict=True):
                 density = simulated.log_posterior(of, self.scale, of.observed)
-                cases[i] = Case(tuple(every[i][0]), of, -density)
+                cases[i] = Case(tuple(law for law, _ in ordered[i]), of, -density)
         return cases
 
     def loss(self, of: simulated.Simulated, counts: Bool[np.ndarray, "seq window #place 1"] | bool = True) -> float:
@@ -154,7 +156,7 @@ class Search(NamedTuple):
         """The hypothesis with each candidate, fitted; the best case of every law, best first."""
         cases = self.fit(hypothesis, [((c,), c.probes[:1]) for c in candidates], steps=SCREEN_STEPS)
         best: dict[tuple[Key, ...], Case] = {}
-        for case in sorted(cases.values(), key=lambda case: case.loss):
+        for case in _ranked(cases):
             best.setdefault(case.keys, case)
         return list(best.values())
 
@@ -332,7 +334,9 @@ def _round(search: Search, hypothesis: Hypothesis, rows: int) -> Round:
     if room > max([MULTI_STEP, *(case.share for case in passing)]) / NAMED:  # else no pair, no function could be chosen
         both = itertools.combinations(singles[:PARTNERS], 2)
         joined = [((*a.laws, *b.laws), (*a.effects, *b.effects)) for a, b in both]
-        pairs = sorted(search.fit(bare, joined, steps=SCREEN_STEPS).values(), key=lambda case: case.loss)
+        few = _ranked(search.fit(bare, joined, steps=FIRST_STEPS))[: 3 * PAIRS_JUDGED]
+        models = [case.of.model for case in few]
+        pairs = _ranked(search.fit(bare, [(case.laws, case.effects) for case in few], models, steps=SCREEN_STEPS))
         functions = search.screened(bare, [*filter(fresh, search.free)])
         best = [*[case for case in pairs if case.sound][:PAIRS_JUDGED], *functions[:FREE]]
         tried += search.judged(bare, best, parts[0])
@@ -369,6 +373,11 @@ def _round(search: Search, hypothesis: Hypothesis, rows: int) -> Round:
     return Round(step._replace(accepted=best.keys[0]), hypothesis.refitted(model), complete)
 
 
+def _ranked(cases: Mapping[int, Case]) -> list[Case]:
+    """Fitted cases, the likeliest first."""
+    return sorted(cases.values(), key=lambda case: case.loss)
+
+
 def _first(singles: Sequence[Case]) -> list[Case]:
     """Gains and biases of inputs, which are judged whatever they explain."""
     return [case for case in singles if isinstance(case.laws[0].start, MotorGain | InputBias)]
@@ -382,7 +391,7 @@ def _rivals(search: Search, bare: Hypothesis, best: Case, singles: Sequence[Case
         laws, effects = tuple(a[:i] + a[i + 1 :] for a in (best.laws, best.effects))
         fresh = [case for case in others if case.keys[0] not in best.keys]
         sets += [((*laws, *case.laws), (*effects, *case.effects)) for case in fresh]
-    fits = sorted(search.fit(bare, sets, steps=SCREEN_STEPS).values(), key=lambda case: case.loss)
+    fits = _ranked(search.fit(bare, sets, steps=SCREEN_STEPS))
     explained = lambda case: 1 - search.loss(case.of) / whole  # noqa: E731
     return [case for case in fits if case.sound and explained(case) >= EQUIVALENT * explained(best)]
 

@@ -16,9 +16,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .actuator import DeadZone, InputEffect, MotorGain, Saturation
+from .actuator import ActuatorLag, DeadZone, InputDelay, InputEffect, MotorGain, Saturation
 from .base import AbstractEffect, Candidate, Scalar, SearchScales, SensorEffect, a, fields, known, one
-from .sensor import SensorBias, SensorScale
+from .sensor import SensorBias, SensorDelay, SensorScale
 
 STRONG = 5.0
 """Prior standard deviation of a strength: multiple of that which moves a state by its typical rate over the range of
@@ -85,30 +85,53 @@ class PlantLaw(AbstractEffect):
         return (1 + scale) * value + bias + bend * (value - self.level) ** 2 / jnp.where(self.edge > 0, self.edge, 1.0)
 
 
+class LateLaw(AbstractEffect):
+    """A delay of an input, a lag of an input, or a delay of readings, by zeros and ones."""
+
+    meaning: ClassVar[str] = "A law of equations that takes time."
+    confirm: ClassVar[str] = "Make a step."
+    seconds: Scalar
+    inputs: Float[Array, "2 *input"] = known()
+    sensors: Float[Array, "1 *readable"] = known()
+
+    def at_drive(self, place, index):
+        return dataclasses.replace(self, inputs=self.inputs[:, index])
+
+    def input(self, u, dt):
+        delay, lag = self.inputs
+        late = InputDelay(self.seconds * delay, channel="").input(u, dt)
+        return jnp.where(lag > 0, ActuatorLag(self.seconds, channel="").input(u, dt), late)
+
+    def at_reading(self, name, index):
+        return dataclasses.replace(self, sensors=self.sensors[:, index])
+
+    def reading(self, value, past):
+        return past(self.seconds * self.sensors[0])
+
+
 def lean(effect: AbstractEffect, system: Any) -> AbstractEffect:
-    """A law as a `PlantLaw`, so that one program serves all; itself where it takes time or has a form of its own."""
-    if type(effect) not in AT_ONCE:
+    """A law as a `PlantLaw` or a `LateLaw`, so that one program serves all; itself where it has a form of its own."""
+    if type(effect) not in PLACES:
         return effect.lean(system)
-    at, place = AT_ONCE[type(effect)]
-    (strength, *inner), none = (getattr(effect, name) for name in fields(effect)), a(1e-12)
-    level, edge = (*inner, none)[0], getattr(effect, "range", a(0.0))
-    inputs, sensors = jnp.zeros((4, len(system.inputs))), jnp.zeros((3, len(system.readable)))
-    if at == "inputs":
-        inputs = inputs.at[place].set(_one_of(system.inputs, effect.channel))
-    else:
-        sensors = sensors.at[place].set(_one_of(system.readable, effect.channel))
+    kind, at, place = PLACES[type(effect)]
+    (first, *inner), none = (getattr(effect, name) for name in fields(effect)), a(1e-12)
+    of = {"inputs": jnp.zeros((4, len(system.inputs))), "sensors": jnp.zeros((3, len(system.readable)))}
+    here = _one_of({"inputs": system.inputs, "sensors": system.readable}[at], effect.channel)
+    of[at] = of[at].at[place].set(jnp.ones_like(here) if effect.channel == "all" else here)
+    if kind is LateLaw:
+        return LateLaw(first, of["inputs"][:2], of["sensors"][:1])
     signals, ports = jnp.zeros(len(system.states) + len(system.inputs)), jnp.zeros(len(system.ports))
-    kind = jnp.zeros(len(FORMS))
-    return PlantLaw(strength, level, none, inputs, sensors, kind, signals, signals, ports, ports, edge)
+    rest = jnp.zeros(len(FORMS)), signals, signals, ports, ports, getattr(effect, "range", a(0.0))
+    return PlantLaw(first, (*inner, none)[0], none, of["inputs"], of["sensors"], *rest)
 
 
 def numbered(effect: AbstractEffect, lean: AbstractEffect) -> AbstractEffect:
     """A law with the numbers of its lean form."""
-    if type(effect) not in AT_ONCE:
+    if type(effect) not in PLACES:
         return effect.with_numbers(lean)
-    numbers, names = cast(PlantLaw, lean), fields(effect)
-    values = numbers.strength, numbers.level
-    return eqx.tree_at(lambda e: [getattr(e, name) for name in names], effect, list(values[: len(names)]))
+    names = fields(effect)
+    values = [getattr(lean, name) for name in fields(lean)[: len(names)]]
+    return eqx.tree_at(lambda e: [getattr(e, name) for name in names], effect, values)
 
 
 def _one_of(names: Sequence[str], name: str | None) -> Float[Array, " name"]:
@@ -575,8 +598,10 @@ class UnknownTerm(SignalEffect):
         return f"a flow into {self.channel} that depends on {' and '.join(self.reads)}"
 
 
-AT_ONCE: dict[type[AbstractEffect], tuple[str, int]] = {
-    MotorGain: ("inputs", 0), InputBias: ("inputs", 1), DeadZone: ("inputs", 2), Saturation: ("inputs", 3),
-    SensorScale: ("sensors", 0), SensorBias: ("sensors", 1), Bend: ("sensors", 2),
+PLACES: dict[type[AbstractEffect], tuple[type[AbstractEffect], str, int]] = {
+    MotorGain: (PlantLaw, "inputs", 0), InputBias: (PlantLaw, "inputs", 1), DeadZone: (PlantLaw, "inputs", 2),
+    Saturation: (PlantLaw, "inputs", 3), SensorScale: (PlantLaw, "sensors", 0), SensorBias: (PlantLaw, "sensors", 1),
+    Bend: (PlantLaw, "sensors", 2), InputDelay: (LateLaw, "inputs", 0), ActuatorLag: (LateLaw, "inputs", 1),
+    SensorDelay: (LateLaw, "sensors", 0),
 }  # fmt: skip
-"""Laws of inputs and readings that take no time: their places in a `PlantLaw`."""
+"""Laws of inputs and readings: the form that each has in common with others, and its place there."""

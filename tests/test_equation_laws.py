@@ -206,8 +206,8 @@ def test_each_law_of_a_pair_is_tried_in_the_place_of_the_other():
         return Case(some, _case(1.0, 1, 0.5).of._replace(model=model, z=np.array([left])), left)
 
     cases = [fitted(law) for law in laws[:3]]
-    fit = lambda bare, every, steps: {i: fitted(*some) for i, (some, _) in enumerate(every)}  # noqa: E731
-    search = SimpleNamespace(fit=fit, loss=lambda of: float(of.z[0]))
+    screened = lambda bare, every, most: sorted((fitted(*some) for some, _ in every), key=lambda c: c.loss)  # noqa: E731
+    search = SimpleNamespace(screened=screened, loss=lambda of: float(of.z[0]))
     rivals = equations._rivals(search, None, fitted(laws[0], laws[3]), cases, 100.0)  # type: ignore[arg-type]
     assert [case.loss for case in rivals] == [40.0, 45.0]  # explained: 60, 55 and, too little, 53 and 40 of 60
 

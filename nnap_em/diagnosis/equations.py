@@ -6,7 +6,7 @@ recordings, and judged on these. A linear screen along smoothed paths would favo
 
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple, cast
 
 import equinox as eqx
@@ -45,7 +45,7 @@ GROWN = 64.0
 Cells = Float[np.ndarray, "*part age obs"]
 """Squared errors, of starts that are not settled first."""
 FIRST_STEPS, SCREEN_STEPS, JUDGED_STEPS = 8, 30, 30
-"""Steps of a fit of any pair, of one in a screen, and of one that is judged."""
+"""Steps of the first fit of all, of the best of these on, and of one that is judged."""
 
 
 class Case(NamedTuple):
@@ -152,13 +152,17 @@ class Search(NamedTuple):
         """Squared error of the predictions that count."""
         return simulated.cost(of.error, self.scale, of.observed & counts)
 
-    def screened(self, hypothesis: Hypothesis, candidates: Sequence[Candidate]) -> list[Case]:
-        """The hypothesis with each candidate, fitted; the best case of every law, best first."""
-        cases = self.fit(hypothesis, [((c,), c.probes[:1]) for c in candidates], steps=SCREEN_STEPS)
+    def screened(
+        self, hypothesis: Hypothesis, every: Sequence[tuple[Sequence[Candidate], Sequence[Any]]], most: int
+    ) -> list[Case]:
+        """The hypothesis with each set of laws, fitted, `most` of them to the end; the best of each, best first."""
         best: dict[tuple[Key, ...], Case] = {}
-        for case in _ranked(cases):
+        for case in _ranked(self.fit(hypothesis, every, steps=FIRST_STEPS).values()):
             best.setdefault(case.keys, case)
-        return list(best.values())
+        few = [*best.values()][:most]
+        models = [case.of.model for case in few]
+        ended = self.fit(hypothesis, [(case.laws, case.effects) for case in few], models, steps=SCREEN_STEPS)
+        return _ranked([*(ended.get(i, case) for i, case in enumerate(few)), *[*best.values()][most:]])
 
     def judged(self, hypothesis: Hypothesis, cases: Sequence[Case], null: Cells) -> list[Case]:
         """The cases with their errors on parts left out, beside those of `null` on each."""
@@ -321,7 +325,7 @@ def _round(search: Search, hypothesis: Hypothesis, rows: int) -> Round:
     search.log(f"{len(some)} candidates; {max(room, 0.0):.0%} of the squared error is not noise of the readings")
     if room < MULTI_STEP:
         return nothing
-    singles = search.screened(bare, some)
+    singles = search.screened(bare, [((law,), law.probes[:1]) for law in some], 3 * PARTNERS)
     short = []
     for numbers in range(1, 4):
         sound = [case for case in singles if case.numbers == numbers and case.sound]
@@ -334,10 +338,8 @@ def _round(search: Search, hypothesis: Hypothesis, rows: int) -> Round:
     if room > max([MULTI_STEP, *(case.share for case in passing)]) / NAMED:  # else no pair, no function could be chosen
         both = itertools.combinations(singles[:PARTNERS], 2)
         joined = [((*a.laws, *b.laws), (*a.effects, *b.effects)) for a, b in both]
-        few = _ranked(search.fit(bare, joined, steps=FIRST_STEPS))[: 3 * PAIRS_JUDGED]
-        models = [case.of.model for case in few]
-        pairs = _ranked(search.fit(bare, [(case.laws, case.effects) for case in few], models, steps=SCREEN_STEPS))
-        functions = search.screened(bare, [*filter(fresh, search.free)])
+        pairs = search.screened(bare, joined, 3 * PAIRS_JUDGED)
+        functions = search.screened(bare, [((law,), law.probes[:1]) for law in search.free if fresh(law)], 2 * FREE)
         best = [*[case for case in pairs if case.sound][:PAIRS_JUDGED], *functions[:FREE]]
         tried += search.judged(bare, best, parts[0])
         passing = [case for case in tried if _passes(case)]
@@ -373,9 +375,9 @@ def _round(search: Search, hypothesis: Hypothesis, rows: int) -> Round:
     return Round(step._replace(accepted=best.keys[0]), hypothesis.refitted(model), complete)
 
 
-def _ranked(cases: Mapping[int, Case]) -> list[Case]:
+def _ranked(cases: Iterable[Case]) -> list[Case]:
     """Fitted cases, the likeliest first."""
-    return sorted(cases.values(), key=lambda case: case.loss)
+    return sorted(cases, key=lambda case: case.loss)
 
 
 def _first(singles: Sequence[Case]) -> list[Case]:
@@ -391,7 +393,7 @@ def _rivals(search: Search, bare: Hypothesis, best: Case, singles: Sequence[Case
         laws, effects = tuple(a[:i] + a[i + 1 :] for a in (best.laws, best.effects))
         fresh = [case for case in others if case.keys[0] not in best.keys]
         sets += [((*laws, *case.laws), (*effects, *case.effects)) for case in fresh]
-    fits = _ranked(search.fit(bare, sets, steps=SCREEN_STEPS))
+    fits = search.screened(bare, sets, 3 * PAIRS_JUDGED)
     explained = lambda case: 1 - search.loss(case.of) / whole  # noqa: E731
     return [case for case in fits if case.sound and explained(case) >= EQUIVALENT * explained(best)]
 

@@ -28,7 +28,9 @@ from .units import is_time
 PLAIN = (",", ".")
 """Marks of columns and of decimals in the CSV files of a data set."""
 _GROUPS = {
-    decimal: re.compile(rf"[+-]?\d{{1,3}}([{other}](?=[\d{other}]*[{decimal}])|[ '’\u00a0\u202f])\d{{3}}(\1\d{{3}})*([{decimal}]\d*)?")
+    decimal: re.compile(
+        rf"[+-]?\d{{1,3}}([{other}](?=[\d{other}]*[{decimal}])|[ '’\u00a0\u202f])\d{{3}}(\1\d{{3}})*([{decimal}]\d*)?"
+    )
     for decimal, other in (".,", ",.")
 }
 """Numbers in groups of thousands by the mark of decimals."""

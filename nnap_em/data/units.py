@@ -28,7 +28,8 @@ _SIZES = {  # names of units, how many of another unit each is, and that one; of
 _WORDS = ("deg/s", "°/s", "deg", "°", "rpm", "mm/s", "mm", "mnm", "nmm", "rad/s", "rad", "m/s", "nm", "n m", "n", "m",
           "ma", *UNITS)  # fmt: skip
 _TIME_NAMES = re.compile(
-    r"_*(?:t|times?|timestamps?|stamp|clock|tout|x_value|(?:uhr|datum[ _/]*)?zeit|zeitstempel|date[ _/]*time|(?:milli)?seconds|minutes|hours|days)",
+    r"_*(?:t|times?|timestamps?|stamp|clock|tout|x_value|(?:uhr|datum[ _/]*)?zeit|zeitstempel|date[ _/]*time|"
+    r"(?:milli)?seconds|minutes|hours|days)",
     re.IGNORECASE,
 )
 """Names of a column of times: __time of PlotJuggler, tout of Simulink, X_Value of LabVIEW."""

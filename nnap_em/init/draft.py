@@ -224,7 +224,7 @@ def columns_table(path: Path, columns: Mapping[str, Address]) -> dict[str, Float
 
 
 def common_step(t: Int[np.ndarray, " row"]) -> tuple[float, float]:
-    """Interval [s] that the intervals of times [ns] are multiples of, but for jitter, and three standard errors of it [s].
+    """Interval [s] of which the steps of times [ns] are multiples, but for jitter, and three standard errors of it.
 
     Without such an interval, the median.
     """

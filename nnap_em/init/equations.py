@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..data.dataset import DataError
-from ..data.noise import reading_noise, resolution
+from ..data.noise import fast_reading_noise, resolution
 from ..data.table import toml_text
 from ..data.units import named_unit
 from ..import_.files import reader
@@ -49,7 +49,7 @@ def draft_equations(path: Path) -> Draft:
         f"columns = {{ {', '.join(f'{toml_text(name)} = {toml_text(state)}' for name, state in names.items())} }}",
         "",
         "[measurement.noise_std]    # read off the high frequencies; what is left out is estimated",
-        *(f"# {toml_text(name)} = {reading_noise(columns[name][None]):.2g}" for name in readings),
+        *(f"# {toml_text(name)} = {fast_reading_noise(columns[name][None]):.2g}" for name in readings),
         "",
         "[start]    # the state in the first row, where it is known but not measured",
         *(f"# {state} = {{ mean = 0.0, std = 0.5 }}" for state in names.values()),

@@ -16,7 +16,7 @@ from .limits import UNBOUNDED, Bounds, read_bounds, read_range
 from .machine import machine_unit, unpacked
 from .servo import AT, TORQUE, Inputs, key_of, read_inputs
 from .table import HOLD, SMOOTH, Declared, RigError, RigWarning, Table, every, nearest, toml_text, whole_table, written
-from .units import factor, named_unit, parameter_unit, quantities, with_names
+from .units import UNITS, factor, named_unit, parameter_unit, quantities, with_names
 
 
 @dataclass(frozen=True)
@@ -108,6 +108,11 @@ class Rig:
         """Unit of all times: s; of equations as [model.units] time declares it, or none where nothing has a unit."""
         units = _units(self.equations) if self.equations else {"dt": "s"}
         return units.get("time", "s" if any(units.values()) else "time units")
+
+    @property
+    def ns(self) -> float:
+        """Nanoseconds in a unit of time; those of a second where its unit is not known."""
+        return 1e9 * UNITS.get(self.time_unit, 1.0)
 
     def column_unit(self, name: str) -> str:
         """The unit in which a column of the logs is read; empty where any may be meant."""

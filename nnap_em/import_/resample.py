@@ -88,9 +88,9 @@ def resample(path: Path, rig: Rig, plan: Plan, shifts: Mapping[str, float], unwr
         if topic not in (used := sorted({at.topic for at in addresses.values()})):
             raise DataError(f"{path}: --shift {topic}: no topic of that name is used; {nearest(topic, used)}")
     recording = read(path, addresses.values())
-    recording = recording._replace(tracks={topic: _timed(track, rig.dt) for topic, track in recording.tracks.items()})
+    recording = recording._replace(tracks={topic: _timed(track, rig) for topic, track in recording.tracks.items()})
     origin = min(int(track.t[0]) for track in recording.tracks.values())
-    clocks = {topic: (track.t - origin) * 1e-9 + shifts.get(topic, 0.0) for topic, track in recording.tracks.items()}
+    clocks = {topic: (track.t - origin) / rig.ns + shifts.get(topic, 0.0) for topic, track in recording.tracks.items()}
     least = {name: 1 if name in rig.logged_inputs else 2 for name in addresses}
     signals = {name: _signal(recording, name, at, clocks[at.topic], least[name]) for name, at in addresses.items()}
     signals, notes = as_taken(signals, rig, unwrap)
@@ -117,10 +117,12 @@ def resample(path: Path, rig: Rig, plan: Plan, shifts: Mapping[str, float], unwr
     )  # fmt: skip
 
 
-def _timed(track: Track, dt: float) -> Track:
+def _timed(track: Track, rig: Rig) -> Track:
     """A table without times, its rows `dt` apart, as the rig declares."""
-    note = f"no times in the table: rows are taken as dt = {dt:g} s apart"
-    return track if track.clock != UNTIMED else track._replace(t=np.round(track.t * dt).astype(np.int64), notes=(note,))
+    if track.clock != UNTIMED:
+        return track
+    note = f"no times in the table: rows are taken as dt = {rig.dt:g} {rig.time_unit} apart"
+    return track._replace(t=np.round(1e-9 * rig.dt * rig.ns * track.t).astype(np.int64), notes=(note,))
 
 
 def _signal(recording: Recording, name: str, at: Address, t: Float[np.ndarray, " message"], least: int) -> Signal:

@@ -213,7 +213,7 @@ def test_the_only_column_beside_time_is_a_reading(tmp_path):
 STEPS = {  # times of rows 0.1 s apart [rows]
     "jitter": lambda k, rng: k + 0.2 * rng.uniform(-1, 1, k.size),
     "two thirds lost": lambda k, rng: k[rng.uniform(size=k.size) < 1 / 3],
-    "a pause": lambda k, rng: k + 1000.4 * (k > 200),
+    "jitter and a pause": lambda k, rng: k + 0.2 * rng.uniform(-1, 1, k.size) + 36000.4 * (k > 200),
 }
 
 

@@ -329,7 +329,7 @@ def _whole(path: Path, table: Float[np.ndarray, "row column"], rows: Int[np.ndar
     used, masked = rows[rows < end], []
     for first, count, kind, hint in (
         (int(missing.argmax()), int(missing[:end].sum()), "gap", "inputs there are interpolated from the rows around"),
-        (end, len(rows) - len(used), "cut", "inputs before these rows are not known: `nnap-em import` reads them"),
+        (end, len(rows) - len(used), "cut", "inputs before these rows cannot be interpolated: `nnap-em import`"),
     ):
         if count:
             k = int(np.searchsorted(rows, first))  # the row of the file after the gap

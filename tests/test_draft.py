@@ -13,7 +13,8 @@ from nnap_em.data.dataset import DataError
 from nnap_em.data.formats import write_csv
 from nnap_em.data.logs import read_logs
 from nnap_em.data.rig import RigError, read_rig
-from nnap_em.init.draft import draft
+from nnap_em.init.draft import common_step, draft
+from nnap_em.init.equations import draft_equations
 from nnap_em.init.from_machine import draft_machine
 from nnap_em.systems import specs
 
@@ -180,3 +181,43 @@ def test_servos_and_uncertain_numbers_of_a_file_are_drafted_by_taking_marks_away
     assert {name: (p.mean, p.std) for name, p in rig.parameters.items()} == {
         "thigh.mass": (1.5, 0.15), "shank.mass": (1.0, 0.1), "hip.armature": (0.02, 0.02), "knee.armature": (0.0, 0.01),
     }  # fmt: skip
+
+
+def test_equations_are_drafted_with_names_and_units_of_formulas_and_import_reads_them(tmp_path):
+    """A recorder's table: lines above, units below the header, decimal commas, grouped thousands, ISO 8601 times."""
+    level = 998.0 + 0.5 * np.arange(60)
+    comma = lambda x: f"{x:,.2f}".translate(str.maketrans(",.", ".,"))  # noqa: E731
+    rows = [f"2026-01-05T23:59:{k // 2:02d}.{k % 2 * 5};{k // 30 * 1.5:g};{comma(y)}" for k, y in enumerate(level)]
+    lines = ["Recorder 4", "", "Time;Pump speed;Level", ";[V];[mm]", *(row.replace("1.5;", "1,5;") for row in rows)]
+    (tmp_path / "log.csv").write_text("\n".join(lines))
+    text = draft_equations(tmp_path / "log.csv").text
+    assert (
+        'inputs = { "Pump_speed" = "V" }' in text and 'states = { "x1" = "mm" }' in text and "dt = 0.5    # s\n" in text
+    )
+    (tmp_path / "rig.toml").write_text(text.replace("# rates = ...", 'rates = { x1 = "k*Pump_speed" }\nk = 1.0\n#'))
+    assert (
+        cli.main(["import", *map(str, (tmp_path / "log.csv", "--rig", tmp_path / "rig.toml", "--out", tmp_path / "b"))])
+        == 0
+    )
+    data = read_logs(tmp_path / "b" / "train", read_rig(tmp_path / "rig.toml", specs), trust=True).data
+    np.testing.assert_allclose(np.asarray(data.y)[0, :, 0], level)
+    np.testing.assert_allclose(np.asarray(data.u)[0, :, 0], 1.5 * (np.arange(60) >= 30))
+
+
+def test_the_only_column_beside_time_is_a_reading(tmp_path):
+    write_csv(tmp_path / "01.csv", _log("u"))
+    text = draft_equations(tmp_path / "01.csv").text
+    assert "inputs = []" in text and 'columns = { "u" = "x1" }' in text
+
+
+STEPS = {  # times of rows 0.1 s apart [rows]
+    "jitter": lambda k, rng: k + 0.2 * rng.uniform(-1, 1, k.size),
+    "two thirds lost": lambda k, rng: k[rng.uniform(size=k.size) < 1 / 3],
+    "jitter and a pause": lambda k, rng: k + 0.2 * rng.uniform(-1, 1, k.size) + 36000.4 * (k > 200),
+}
+
+
+@pytest.mark.parametrize("of", STEPS.values(), ids=STEPS)
+def test_the_common_step_of_uneven_rows_is_found(of):
+    t = np.sort(of(np.arange(600.0), np.random.default_rng(0)))
+    assert common_step(np.round(1e8 * t).astype(np.int64))[0] == pytest.approx(0.1, rel=1e-3)  # 0.2 rows of 600

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import math
+import re
 from pathlib import Path
 
 import equinox as eqx
@@ -11,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.linalg
+import scipy.signal
 from helpers import written_again
 
 from nnap_em.data.dataset import Dataset, pad
@@ -340,3 +342,40 @@ def test_identify_finds_the_parameters_and_the_hidden_state(fit, tmp_path):
     again = load(tmp_path / "model.npz")
     assert again.rig == fit.rig and again.model.pace == fit.model.pace
     assert eqx.tree_equal(again.model, fit.model)
+
+
+TANK = """[model]
+type = "equations"
+inputs = ["u"]
+states = ["h", "w", "s"]
+rates = { h = "k*u - h", w = "0.2*(h - w)", s = "RATE" }
+k = { mean = 1.0, std = 0.5 }
+units = { y = "V", time = "min" }
+[measurement]
+columns = { y = "COLUMN" }
+"""
+SEEN = {  # rate of the third state, reading; result and words of `check`
+    "a lag of what is read decays to it": ("w - s", "2*h", "ok", "a whole log determines 3 of 3"),
+    "an integrator that is not read": ("w", "2*h", "error", "2 of 3 directions of the state; not determined: s"),
+    "an integrator that is read": ("w", "s", "ok", "a whole log determines 3 of 3"),
+}
+
+
+@pytest.mark.parametrize("rate, column, mark, words", SEEN.values(), ids=SEEN)
+def test_states_are_judged_over_whole_logs_in_the_units_of_the_plant(tmp_path, rate, column, mark, words):
+    """The input rests in the first half, so that nothing moves there."""
+    u = np.repeat([0.0, 0.0, 0.0, 0.0, 1.0, 0.3, 1.5, 0.2], 50)
+    h = scipy.signal.lfilter([1 - np.exp(-0.5)], [1, -np.exp(-0.5)], np.append(0, u))[:-1]
+    w = np.append(0, np.cumsum(h)[:-1]) * 0.1
+    y = 2 * h if column == "2*h" else 0.5 * np.append(0, np.cumsum(w)[:-1])
+    y = y + 0.01 * np.random.default_rng(0).standard_normal(400)
+    data = pad([(0.5 * np.arange(400), u[:, None], y[:, None])])
+    results = check(
+        _rig(tmp_path, TANK.replace("RATE", rate).replace("COLUMN", column)), data, None, key=jax.random.key(0)
+    )
+    states = next(result for result in results if result.subject == "states")
+    assert (states.mark, words in states.text) == (mark, True), states.text
+    said = " ".join(result.text for result in results)
+    assert "200 min, 400 rows" in said and "rows 0.5 min apart" in said and " V by the log" in said
+    assert ("integrators: s" in said) == (rate == "w")
+    assert not re.search(r"joint|torque|current| s\b(?<!: s)", said), said

@@ -2,6 +2,7 @@
 
 import functools
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -94,9 +95,11 @@ def test_the_mean_of_a_held_signal_is_that_of_its_values_on_a_fine_grid():
 
 
 def test_a_reading_is_interpolated_only_between_near_neighbours():
-    s = Signal("a", np.array([0.0, 0.01, 0.02, 0.05, 0.06, 0.07]), np.arange(6.0))
-    y = interpolated(s, np.array([0.0, 0.005, 0.02, 0.03, 0.05, 0.065, 0.07, 0.08]), 0.01, 0.015)
-    np.testing.assert_allclose(y, [0, 0.5, 2, np.nan, 3, 4.5, 5, np.nan], rtol=1e-12)
+    s = Signal("a", np.array([0.0, 0.01, 0.02, 0.04, 0.05, 0.06]), np.arange(6.0))
+    y = interpolated(s, np.array([0.0, 0.005, 0.02, 0.024, 0.03, 0.04, 0.055, 0.06, 0.07]), 0.01)
+    np.testing.assert_allclose(
+        y, [0, 0.5, 2, 2.2, np.nan, 3, 4.5, 5, np.nan], rtol=1e-12
+    )  # a row that was lost is empty
 
 
 def test_slow_readings_stand_in_their_nearest_rows(tmp_path):
@@ -240,3 +243,33 @@ def test_a_machine_from_a_file_is_imported_and_found_from_the_new_folder(tmp_pat
     one, other = unpacked(again.machine), unpacked(rig.machine)
     assert (Path(one.file).name, one._replace(file="")) == (other.file, other._replace(file=""))
     assert read_logs(out / "train", again).data.y.shape[-1] == len(rig.measured)
+
+
+EQUATIONS = """format = 1
+name = "lag"
+[model]
+type = "equations"
+inputs = ["u"]
+states = ["x"]
+rates = { x = "u - x" }
+units = { time = "days" }
+[sampling]
+dt = 1
+input_hold = "zero-order"
+clock = "sequence"
+[measurement]
+columns = ["x"]
+"""
+
+
+def test_rare_readings_beside_an_input_in_every_row_are_imported_in_days(tmp_path, capsys):
+    """A reading every tenth day, and rows that end 80 days before the last ones: these are said to be left out."""
+    days = np.append(np.arange(200), np.arange(280, 300))
+    rows = [f"{k},{k % 7},{k if k % 10 == 0 else ''}" for k in days]
+    (tmp_path / "log.csv").write_text("\n".join(["time (days),u,x", *rows]))
+    rig = _rig(tmp_path, text=EQUATIONS, columns="")
+    table = read_table(next((_imported(tmp_path / "log.csv", rig) / "train").iterdir()), ("time", "u"), ("x",))
+    np.testing.assert_array_equal(table[:, 0], np.arange(len(table)))
+    np.testing.assert_array_equal(table[:, 1], np.arange(len(table)) % 7)
+    np.testing.assert_array_equal(table[:, 2], np.where(np.arange(len(table)) % 10, np.nan, np.arange(len(table))))
+    assert re.search(r"of 2\d\d rows are left out, in 1 piece .*shortest = SECONDS keeps", capsys.readouterr().err)

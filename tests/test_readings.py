@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from nnap_em.data.dataset import pad
-from nnap_em.data.noise import reading_noise, resolution
+from nnap_em.data.noise import fast_reading_noise, reading_noise, resolution
 from nnap_em.data.rig import Declared, Rig
 from nnap_em.em.build import build
 from nnap_em.em.mstep import RELEASES, RESTING_OFFSET
@@ -80,3 +80,12 @@ def test_a_fit_of_logs_that_rest_begins_coarse_and_one_of_logs_that_move_does_no
     np.testing.assert_allclose(widths[:-1], RESTING_OFFSET * np.asarray(RELEASES))
     assert np.isinf(widths[-1]) and 0 < float(resting.reach[0]) < 1.0  # a tenth of the drive, 1 N
     assert moving.reach.shape == resting.reach.shape == (1,)
+
+
+@pytest.mark.parametrize("period, share", [(9, 0.1), (50, 0.03)])
+def test_a_fast_signal_is_not_taken_for_noise(period, share):
+    """Of nine rows a period third differences are (2 sin(pi/9))^3 / sqrt(20) of the amplitude, 7 %."""
+    y = np.sin(2 * np.pi / period * np.arange(2000.0) + 0.1 * np.arange(2000.0) ** 0.5)
+    noisy = (y + 1e-2 * np.random.default_rng(0).standard_normal(2000))[None]
+    assert fast_reading_noise(noisy) == pytest.approx(1e-2, rel=share)
+    assert (reading_noise(noisy) > 5e-2) == (period == 9)

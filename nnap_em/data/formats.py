@@ -6,6 +6,7 @@ import dataclasses
 import difflib
 import functools
 import math
+import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from functools import cached_property
@@ -26,6 +27,13 @@ from .units import is_time
 
 PLAIN = (",", ".")
 """Marks of columns and of decimals in the CSV files of a data set."""
+_GROUPS = {
+    decimal: re.compile(
+        rf"[+-]?\d{{1,3}}([{other}](?=[\d{other}]*[{decimal}])|[ '’\u00a0\u202f])\d{{3}}(\1\d{{3}})*([{decimal}]\d*)?"
+    )
+    for decimal, other in (".,", ",.")
+}
+"""Numbers in groups of thousands by the mark of decimals."""
 Table = Float[np.ndarray, "time column"]
 
 
@@ -331,8 +339,13 @@ def read_bytes(path: Path, most: int = -1) -> bytes:
 
 
 def number(text: str, decimal: str = ".") -> float:
-    """A number, or a truth value of a PLC; NaN for an empty field, infinite for another text."""
+    """A number, or a truth value of a PLC; NaN for an empty field, infinite for another text.
+
+    Thousands may be grouped, by the other mark where decimals follow: 1,016 alone may be 1.016 as well.
+    """
     text = text.strip()
+    if group := _GROUPS[decimal].fullmatch(text):
+        text = text.replace(group[1], "")
     if decimal == ",":
         text = text.replace(".", "?").replace(",", ".")
     try:

@@ -294,7 +294,7 @@ def _rows(path: Path, t: Float[np.ndarray, " time"], rig: Rig) -> Int[np.ndarray
     steps = np.diff(t) / rig.dt
     typical = np.median(steps)
     if abs(typical - 1) > TOLERANCE and abs(steps.mean() - 1) > TOLERANCE:
-        hint = other_unit(float(typical), "correct [sampling] dt of rig.toml, or resample")
+        hint = other_unit(float(typical), "correct [sampling] dt of rig.toml, or resample with `nnap-em import`")
         refuse(path, "column 'time'", f"rows are {typical * rig.dt:.6g} s apart, rig.toml says {rig.dt:g} s", hint)
     intervals = np.maximum(np.round(steps), 1)
     wrong = np.abs(steps - intervals) > TOLERANCE
@@ -329,7 +329,7 @@ def _whole(path: Path, table: Float[np.ndarray, "row column"], rows: Int[np.ndar
     used, masked = rows[rows < end], []
     for first, count, kind, hint in (
         (int(missing.argmax()), int(missing[:end].sum()), "gap", "inputs there are interpolated from the rows around"),
-        (end, len(rows) - len(used), "cut", "inputs before these rows cannot be interpolated: not used"),
+        (end, len(rows) - len(used), "cut", "inputs before these rows cannot be interpolated: `nnap-em import`"),
     ):
         if count:
             k = int(np.searchsorted(rows, first))  # the row of the file after the gap

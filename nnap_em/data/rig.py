@@ -16,7 +16,7 @@ from .limits import UNBOUNDED, Bounds, read_bounds, read_range
 from .machine import machine_unit, unpacked
 from .servo import AT, TORQUE, Inputs, key_of, read_inputs
 from .table import HOLD, SMOOTH, Declared, RigError, RigWarning, Table, every, nearest, toml_text, whole_table, written
-from .units import factor, named_unit, parameter_unit, quantities, with_names
+from .units import UNITS, factor, named_unit, parameter_unit, quantities, with_names
 
 
 @dataclass(frozen=True)
@@ -102,6 +102,17 @@ class Rig:
         if self.equations:
             return _units(self.equations).get(name, "")
         return machine_unit(self.machine, name) if self.machine else parameter_unit(name)
+
+    @property
+    def time_unit(self) -> str:
+        """Unit of all times: s; of equations as [model.units] time declares it, or none where nothing has a unit."""
+        units = _units(self.equations) if self.equations else {"dt": "s"}
+        return units.get("time", "s" if any(units.values()) else "time units")
+
+    @property
+    def ns(self) -> float:
+        """Nanoseconds in a unit of time; those of a second where its unit is not known."""
+        return 1e9 * UNITS.get(self.time_unit, 1.0)
 
     def column_unit(self, name: str) -> str:
         """The unit in which a column of the logs is read; empty where any may be meant."""
@@ -284,7 +295,7 @@ def _tables(rig: Rig) -> dict[str, dict[str, Any]]:
         of, inputs = json.loads(rig.equations), {}
         parts = {} if of["function"] else {key: of[key] for key in ("states", "inputs", "rates")}
         model = numbers | {key: names if all(names.values()) and names else list(names) for key, names in parts.items()}
-        model["units"] = {name: unit for name, unit in of["units"].items() if name in rig.parameters}
+        model["units"] = of["units"]
         model["unknown"] = {name: {"signals": signals} for name, signals in of["terms"].items()}
         model["unknown"] |= {name: {"signals": x, "enters": port} for name, (port, x) in of["enters"].items()}
         if of["readings"]:

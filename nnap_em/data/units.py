@@ -12,7 +12,8 @@ _UNIT_OF = {  # of parameters and states, by their names
 }  # fmt: skip
 UNITS = {
     "s": 1.0, "sec": 1.0, "seconds": 1.0, "ms": 1e-3, "milliseconds": 1e-3, "us": 1e-6, "µs": 1e-6,
-    "microseconds": 1e-6, "ns": 1e-9, "nanoseconds": 1e-9, "min": 60.0, "h": 3600.0, "days": 86400.0,
+    "microseconds": 1e-6, "ns": 1e-9, "nanoseconds": 1e-9, "min": 60.0, "minutes": 60.0, "h": 3600.0, "hours": 3600.0,
+    "days": 86400.0,
 }  # fmt: skip
 """Seconds in the units of times."""
 _SIZES = {  # names of units, how many of another unit each is, and that one; of itself: nothing simpler
@@ -27,7 +28,8 @@ _SIZES = {  # names of units, how many of another unit each is, and that one; of
 _WORDS = ("deg/s", "°/s", "deg", "°", "rpm", "mm/s", "mm", "mnm", "nmm", "rad/s", "rad", "m/s", "nm", "n m", "n", "m",
           "ma", *UNITS)  # fmt: skip
 _TIME_NAMES = re.compile(
-    r"_*(?:t|times?|timestamps?|stamp|clock|tout|x_value|(?:uhr|datum[ _/]*)?zeit|zeitstempel|date[ _/]*time)",
+    r"_*(?:t|times?|timestamps?|stamp|clock|tout|x_value|(?:uhr|datum[ _/]*)?zeit|zeitstempel|date[ _/]*time|"
+    r"(?:milli)?seconds|minutes|hours|days)",
     re.IGNORECASE,
 )
 """Names of a column of times: __time of PlotJuggler, tout of Simulink, X_Value of LabVIEW."""

@@ -12,19 +12,21 @@ from jaxtyping import Float, PRNGKeyArray
 from ..data.dataset import Array, Dataset
 from ..data.logs import REPEAT, Logs, logs_of_arrays
 from ..data.machine import unpacked
-from ..data.noise import reading_noise
+from ..data.noise import fast_reading_noise
 from ..data.rig import HOLD, SMOOTH, Rig, RigError
 from ..data.servo import TORQUE
 from ..em.build import LAG, NO_MACHINE, Scales, build_system, measure_scales
 from ..em.equations import infinite_rates, motion
 from ..em.readings import onset
 from ..em.servos import build_servos, steps_of_sample
-from ..em.simulated import filter_path, windows
+from ..em.simulated import filter_path
 from ..model.base import prepare
 from ..model.friction import NoFriction
 from ..model.state_space import MOST_STEPS, StateSpaceModel
 from ..numerics.digits import counted
+from ..numerics.gaussian import Gaussian
 from ..numerics.parallel import each
+from ..smoother.kalman import TANGENT, ekf, kalman_filter
 from ..smoother.posterior import AbstractSmoother
 from ..systems import AbstractSystem
 from .identifiability import identifiability, not_identifiable, sentences
@@ -42,6 +44,7 @@ RECORDED = 10.0
 """Length of a recording in slowest time constants."""
 SAME_HOLD = 0.25
 """Distance to the lag of the other hold, half a row, within which that is meant [rows]: half way."""
+LOST = "the declared model cannot follow the logs; look at units, signs and parameters"
 _LONG = 20.0, 500  # s and rows of a sequence from which on it is better cut: a hidden joint is lost later on
 
 
@@ -63,7 +66,7 @@ class Along(NamedTuple):
     reading: Float[np.ndarray, "seq time obs state"]
     """Jacobian of the reading."""
     rate: Float[np.ndarray, "seq time state state"] | None = None
-    """Jacobian of the time derivative of the state [1/s]; not of equations."""
+    """Jacobian of the time derivative of the state [1/s]."""
 
 
 def check(
@@ -124,26 +127,60 @@ def check(
 
 def _equations(rig: Rig, problem: Identified, data: Dataset) -> Iterator[CheckResult]:
     """Modes of equations against rows and recordings, noise, and observability of their states over whole logs."""
-    model, longest = problem.model, float(data.valid.sum(axis=1).max()) * rig.dt
+    model, longest, unit = problem.model, float(data.valid.sum(axis=1).max()) * rig.dt, rig.time_unit
     seen = motion(model, data)
     fastest, brief = 1 / max(seen.fastest, 1e-12), longest < RECORDED * seen.slowest < np.inf
-    text = f"rows {rig.dt:g} s apart, time constants of the declared equations {fastest:.3g} to {seen.slowest:.3g} s"
+    ends = dict.fromkeys(f"{time:.3g}" for time in (fastest, seen.slowest) if time < 1e6 * longest)
+    modes = f"time constants of the declared equations {' to '.join(ends)} {unit}" if ends else "no time constants"
+    text = f"rows {rig.dt:g} {unit} apart, {modes}" + ", none decays" * bool(ends and seen.slowest == np.inf)
     text += f"; integrators: {', '.join(seen.kept)}" if seen.kept else ""
-    text += f"; unstable: {', '.join(seen.unstable)}, at {seen.growth:.3g} 1/s" if seen.growth else ""
+    text += f"; unstable: {', '.join(seen.unstable)}, at {seen.growth:.3g} 1/{unit}" if seen.growth else ""
     lost, wild = not len(seen.rate), seen.growth * 2 * rig.dt > 1
     hints = {
         "no states follow the readings: look at signs, units and parameters": (lost, lost),
         "errors grow too fast between two rows: sample faster, or look at units and signs": (wild, wild),
         "the fastest is over between two rows: sample faster, or look at the units of parameters": (fastest < rig.dt,),
-        f"record {RECORDED:g} of the slowest at least, here {longest:.3g} s": (brief,),
+        f"record {RECORDED:g} of the slowest at least, here {longest:.3g} {unit}": (brief,),
     }
-    yield _row("sampling", f"{text}; predictions are judged up to {model.pace:g} s ahead", hints)
+    yield _row("sampling", f"{text}; predictions are judged up to {model.pace:g} {unit} ahead", hints)
     yield from _noise(rig, model, data)
-    at = windows(model, data)  # a start that nothing shows, as at rest, is one of many
-    place = at.rows * np.arange(at.count)[:, None] + np.arange(at.rows)
-    cut = lambda part: np.asarray(part)[:, place].reshape(-1, at.rows, *part.shape[2:])  # noqa: E731
-    along = Along(*map(cut, each(filter_path, model, jax.device_put(data))))
-    yield from _observability(model, along, cut(data.valid))
+    yield _determined(rig, model, data)
+
+
+def _determined(rig: Rig, model: StateSpaceModel, data: Dataset) -> CheckResult:
+    """States that whole logs determine, by the covariance of the last one under the declared equations alone.
+
+    That of a filter without process noise along the path of the first model, in units of how far each state moves: a
+    start that decays is known by the inputs, one that an integrator keeps only by a reading.
+    """
+    names, system = model.system.states, model.system
+    path = np.asarray(each(filter_path, model, jax.device_put(data))[0])[np.asarray(data.valid)]
+    scale = np.maximum([_std(one) for one in path.T], 1e-12)
+    wide = Gaussian(model.start.mean, jnp.diag(jnp.asarray(scale**2)))
+    last = np.asarray(each(_last_covariance, (model, wide), jax.device_put(data))) / np.outer(scale, scale)
+    last = last[np.isfinite(last).all(axis=(1, 2))]
+    if not len(last):
+        return CheckResult(ERROR, "states", LOST)
+    known = np.sum(np.median(np.linalg.eigvalsh(last), axis=0) < 0.5)
+    left = dict(zip(names, np.median(np.sqrt(np.einsum("sii->si", last)), axis=0), strict=True))
+    left |= {system.state_of(column): 0.0 for column in rig.measured}
+    dark, weak = ([n for n in names if least < left[n] <= most] for least, most in ((0.5, np.inf), (0.2, 0.5)))
+    shown = "measure more of the state, or change the inputs so that it shows"
+    never, hardly = f"not determined: {', '.join(dark)}: {shown}", f"hardly determined: {', '.join(weak)}"
+    return _row(
+        "states",
+        f"a whole log determines {known} of {len(names)} directions of the state",
+        {never: (dark, dark), hardly: (weak,)},
+    )
+
+
+def _last_covariance(common: tuple[StateSpaceModel, Gaussian], seq: Dataset) -> Array:
+    """Covariance of the last state of a filter from a start, without process noise."""
+    (model, start), still = common, -100.0
+    ready = prepare(common[0], seq)
+    along = ekf(model, model.start, ready, TANGENT)
+    quiet = jnp.full_like(model.log_q, still)
+    return kalman_filter(quiet, model.log_r, start, along.affine, along.reading, ready).state.cov[-1]
 
 
 def _first(data: Dataset, rows: int) -> Dataset:
@@ -177,14 +214,14 @@ def _row(subject: str, text: str, hints: Mapping[str, Sequence[object]]) -> Chec
 
 
 def _amount(rig: Rig, data: Dataset, test: Logs | None) -> Iterator[CheckResult]:
-    rows = data.valid.sum(axis=1)
+    rows, unit = data.valid.sum(axis=1), rig.time_unit
     few, long = rows.sum() < 100 or rows.max() < 20, rows.max() > max(_LONG[0] / rig.dt, _LONG[1])
     hints = {
-        "too few; record some minutes": (few or rows.sum() < 1000, few),
-        f"the shortest is {rows.min() * rig.dt:.2g} s: leave out what is under 60 rows": (rows.min() < 60,),
+        f"too few; record {'more' if rig.equations else 'some minutes'}": (few or rows.sum() < 1000, few),
+        f"the shortest is {rows.min() * rig.dt:.2g} {unit}: leave out what is under 60 rows": (rows.min() < 60,),
         "cut them into sequences of some seconds": (long and not rig.equations,),
     }
-    text = f"{counted(len(rows), 'training sequence')}, {rows.sum() * rig.dt:.3g} s, {rows.sum()} rows"
+    text = f"{counted(len(rows), 'training sequence')}, {rows.sum() * rig.dt:.3g} {unit}, {rows.sum()} rows"
     yield _row("length", text, hints)
     text = f"{counted(len(test.files) if test else 0, 'test sequence')}, none of them in train"
     yield _row("test", text, {"no prediction error will be reported": (test is None,)})
@@ -230,17 +267,23 @@ def _sampling(rig: Rig, along: Along, scales: Scales) -> Iterator[CheckResult]:
 
 def _noise(rig: Rig, model: StateSpaceModel, data: Dataset) -> Iterator[CheckResult]:
     """Noise of the readings beside that which is declared, and beside their motion."""
+    rises = "the signal hardly rises above it: change the inputs more"
+    rises = rises if rig.equations else "the motion hardly rises above it: move or excite more"
     for i, name in enumerate(rig.measured):
-        unit, signal, declared = model.system.unit(name), np.asarray(data.y)[..., i], rig.noise_std.get(name)
-        seen = reading_noise(signal)
+        unit, signal, declared = (
+            f" {model.system.unit(name)}".rstrip(),
+            np.asarray(data.y)[..., i],
+            rig.noise_std.get(name),
+        )
+        seen = fast_reading_noise(signal)
         noisy = max(seen, declared or 0.0) > 0.3 * _std(signal)
         alone = name not in model.system.sensors  # of three axes one may sense nothing
         ratio = seen / declared if declared else 1.0
-        said = f"declared {declared:.2g} {unit}" if declared else "not declared, so it is estimated"
-        text = f"{seen:.2g} {unit} by the log's high frequencies, {said}"
+        said = f"declared {declared:.2g}{unit}" if declared else "not declared, so it is estimated"
+        text = f"{seen:.2g}{unit} by the log's high frequencies, {said}"
         hints = {
             "declare more, or leave it out to have it estimated": (ratio > 3, ratio > 30),
-            "the motion hardly rises above it: move or excite more, or look at the units": (noisy, noisy and alone),
+            f"{rises}, or look at the units": (noisy, noisy and alone),
             "the log was filtered, or less is true": (ratio < 0.1,),
         }
         yield _row("noise", f"{name}: {text}", hints)
@@ -253,10 +296,11 @@ def rates(rig: Rig, data: Dataset) -> Iterator[CheckResult]:
         found = timing(y, w, rig.dt)
         if found is None:
             continue
-        lag = f"{abs(found.late):.3g} s ({abs(found.late) / rig.dt:.3g} rows)"
+        lag = f"{abs(found.late):.3g} {rig.time_unit} ({abs(found.late) / rig.dt:.3g} rows)"
         late, first = (rate, f"the derivative of {name}") if found.late > 0 else (name, rate)
         text = f"{rate} is the derivative of {name}, {lag} {'late' if found.late > 0 else 'early'}"
-        scaled = f"{rate} is {found.scale:.4g} times the derivative of {name}: correct the unit or gear of one"
+        gear = "" if rig.equations else " or gear"
+        scaled = f"{rate} is {found.scale:.4g} times the derivative of {name}: correct the unit{gear} of one"
         shifted = f"{late} is {lag} later than {first}; take {late} out of [measurement] columns, or filter neither"
         hints = {scaled: found.wrong[:1], shifted: found.wrong[1:]}
         yield _row("rate", "" if any(found.wrong) else text, hints)
@@ -411,13 +455,12 @@ def _observability(model: StateSpaceModel, along: Along, valid: np.ndarray) -> I
             gram = gramian(transition[:last], reading[:last] / noise, scale)
             grams += [gram] if np.isfinite(gram).all() else []
     if not grams:
-        text = "the declared model cannot follow the logs; look at units, signs and parameters"
-        yield CheckResult(ERROR, "states", text)
+        yield CheckResult(ERROR, "states", LOST)
         return
     seen = np.sum(np.median([np.linalg.eigvalsh(gram) for gram in grams], axis=0) > 1)
     left = dict(zip(names, np.median([undetermined(gram) for gram in grams], axis=0), strict=True))
     dark, weak = ([n for n in names if least < left[n] <= most] for least, most in ((0.5, np.inf), (0.2, 0.5)))
-    shown = "move so that the hidden joint shakes the rest" if dof else "change the inputs so that it shows"
+    shown = "move so that the hidden joint shakes the rest"
     hints = {
         f"not determined: {', '.join(dark)}: measure more of the state, or {shown}": (dark, {*dark} & {*names[dof:]}),
         f"hardly determined: {', '.join(weak)}": (weak,),

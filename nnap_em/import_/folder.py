@@ -37,6 +37,6 @@ def write_sequences(folder: Path, logs: Sequence[Resampled], files: Sequence[str
     for log in logs:
         used = [stretch for stretch in log.sequences if not stretch.why]
         for stretch, values in zip(used, log.values, strict=True):
-            offset = 0.0 if rig.clock == "sequence" else (log.origin - logs[0].origin) * 1e-9 + stretch.start
+            offset = 0.0 if rig.clock == "sequence" else (log.origin - logs[0].origin) / rig.ns + stretch.start
             time = offset + rig.dt * np.arange(stretch.rows)
             write_csv(folder / next(names), {"time": time} | dict(values))

@@ -1,7 +1,7 @@
 """One log on the grid of its rig: columns, sequences, and an account of what was done."""
 
 import math
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -32,7 +32,6 @@ from .signals import (
     interpolated,
     longest_silence,
     present,
-    reach,
     runs,
     sent_on_change,
     straight,
@@ -89,9 +88,9 @@ def resample(path: Path, rig: Rig, plan: Plan, shifts: Mapping[str, float], unwr
         if topic not in (used := sorted({at.topic for at in addresses.values()})):
             raise DataError(f"{path}: --shift {topic}: no topic of that name is used; {nearest(topic, used)}")
     recording = read(path, addresses.values())
-    recording = recording._replace(tracks={topic: _timed(track, rig.dt) for topic, track in recording.tracks.items()})
+    recording = recording._replace(tracks={topic: _timed(track, rig) for topic, track in recording.tracks.items()})
     origin = min(int(track.t[0]) for track in recording.tracks.values())
-    clocks = {topic: (track.t - origin) * 1e-9 + shifts.get(topic, 0.0) for topic, track in recording.tracks.items()}
+    clocks = {topic: (track.t - origin) / rig.ns + shifts.get(topic, 0.0) for topic, track in recording.tracks.items()}
     least = {name: 1 if name in rig.logged_inputs else 2 for name in addresses}
     signals = {name: _signal(recording, name, at, clocks[at.topic], least[name]) for name, at in addresses.items()}
     signals, notes = as_taken(signals, rig, unwrap)
@@ -113,14 +112,17 @@ def resample(path: Path, rig: Rig, plan: Plan, shifts: Mapping[str, float], unwr
         rows,
         tuple(stretch for stretch, _ in sequences),
         tuple(columns for stretch, columns in sequences if not stretch.why),
-        (*recording.notes, *units, *notes, *_late(recording.tracks, rig.dt, shifts), *_notes(rig, signals)),
-    )
+        (*recording.notes, *units, *notes, *_late(recording.tracks, rig.dt, shifts), *_notes(rig, signals),
+         *_dropped(rows, [stretch for stretch, _ in sequences], plan)),
+    )  # fmt: skip
 
 
-def _timed(track: Track, dt: float) -> Track:
+def _timed(track: Track, rig: Rig) -> Track:
     """A table without times, its rows `dt` apart, as the rig declares."""
-    note = f"no times in the table: rows are taken as dt = {dt:g} s apart"
-    return track if track.clock != UNTIMED else track._replace(t=np.round(track.t * dt).astype(np.int64), notes=(note,))
+    if track.clock != UNTIMED:
+        return track
+    note = f"no times in the table: rows are taken as dt = {rig.dt:g} {rig.time_unit} apart"
+    return track._replace(t=np.round(1e-9 * rig.dt * rig.ns * track.t).astype(np.int64), notes=(note,))
 
 
 def _signal(recording: Recording, name: str, at: Address, t: Float[np.ndarray, " message"], least: int) -> Signal:
@@ -150,8 +152,8 @@ def _gridded(path: Path, rig: Rig, plan: Plan, signals: Mapping[str, Signal]) ->
     }
     common = _common(path, signals, watched | commanded)
     name, fastest = min(readings.items(), key=lambda item: item[1].interval)
-    finest = 4.0  # rows from one reading to the next of the fastest topic from which on the grid is refused as too fine
-    if fastest.interval > finest * dt:
+    finest = 4.0  # rows from one message to the next of the fastest topic from which on the grid is refused as too fine
+    if min(s.interval for s in signals.values() if rig.equations or s.topic == fastest.topic) > finest * dt:
         problem = f"dt = {dt:g} s is much finer than the readings, {fastest.interval:.4g} s apart ({name})"
         other = f"write dt = {float(f'{fastest.interval:.2g}'):g} in rig.toml"
         refuse(path, "[sampling] dt", problem, other_unit(fastest.interval / dt, other))
@@ -188,7 +190,7 @@ def _sequence(stretch: Stretch, rig: Rig, mean: bool, signals: Mapping[str, Sign
     value = straight if rig.input_hold == SMOOTH else averaged if mean else held
     columns = {name: value(signals[name], at, rig.dt) for name in rig.logged_inputs}
     for name in rig.measured:
-        columns[name] = interpolated(signals[name], at, rig.dt, reach(signals[name], rig.dt))
+        columns[name] = interpolated(signals[name], at, rig.dt)
     missing = {name: int(np.isnan(columns[name]).sum()) for name in rig.measured}
     why = next((f"{name} has no reading there" for name, count in missing.items() if stretch.rows - count < 2), "")
     return stretch._replace(missing=missing, why=why), columns
@@ -203,6 +205,15 @@ def _late(tracks: Mapping[str, Track], dt: float, shifts: Collection[str]) -> It
                 side = "behind" if each > 0 else "ahead of"
                 hint = f"where this is no latency, --shift {topic}={each:.3g} takes it out"
                 yield f"stamps of {topic} are {abs(each):.3f} s {side} the log times, not those of others: {hint}"
+
+
+def _dropped(rows: int, sequences: Sequence[Stretch], plan: Plan) -> Iterator[str]:
+    """A message where more than a twentieth of the rows are in sequences that are too short."""
+    lost = [stretch.rows for stretch in sequences if stretch.why]
+    if sum(lost) > 0.05 * rows:
+        text = f"{sum(lost)} of {counted(rows, 'row')} are left out, in {counted(len(lost), 'piece')} between silences"
+        most = "5 intervals" if plan.gap is None else f"{plan.gap:g} s"
+        yield f"{text} of more than {most}: [import] gap = SECONDS bridges longer ones, shortest = SECONDS keeps pieces"
 
 
 def _notes(rig: Rig, signals: Mapping[str, Signal]) -> Iterator[str]:

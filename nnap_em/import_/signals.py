@@ -60,12 +60,11 @@ def averaged(signal: Signal, at: Float[np.ndarray, " row"], dt: float) -> Float[
     return (integral(at + dt) - integral(at)) / dt
 
 
-def interpolated(signal: Signal, at: Float[np.ndarray, " row"], dt: float, reach: float) -> Float[np.ndarray, " row"]:
+def interpolated(signal: Signal, at: Float[np.ndarray, " row"], dt: float) -> Float[np.ndarray, " row"]:
     """Straight lines between neighbours; NaN where there is no value.
 
-    There is none where neighbours are more than `reach` [s] apart or a jump lies between them, nor, where readings come
-    slower than rows, in rows that are nearest to no reading.  Between readings of noise sigma a value has less: from
-    sigma / sqrt(2) on.
+    There is none where a jump lies between neighbours, nor, where these are further apart than rows, in rows that are
+    nearest to no reading.  Between readings of noise sigma a value has less: from sigma / sqrt(2) on.
     """
     t, slack = signal.t, SAME_TIME * dt
     right = np.clip(np.searchsorted(t, at), 1, max(t.size - 1, 1))
@@ -73,9 +72,8 @@ def interpolated(signal: Signal, at: Float[np.ndarray, " row"], dt: float, reach
     x = np.clip(at, t[0], t[-1])
     exact = np.minimum(np.abs(x - t[right]), np.abs(x - t[right - 1])) <= slack
     across = np.isin(right, signal.jumps)
-    known = (at >= t[0] - slack) & (at <= t[-1] + slack) & ((~across & (width <= reach)) | exact)
-    if signal.interval > SLOW * dt:
-        known &= np.searchsorted(t, at + dt / 2) > np.searchsorted(t, at - dt / 2)
+    near = np.searchsorted(t, at + dt / 2) > np.searchsorted(t, at - dt / 2)
+    known = (at >= t[0] - slack) & (at <= t[-1] + slack) & ((~across & (near | (width <= SLOW * dt))) | exact)
     share = (x - t[right - 1]) / width
     share = np.where(across, np.round(share), share)
     y = signal.y[right - 1] * (1 - share) + signal.y[right] * share
@@ -96,12 +94,6 @@ class Stretch(NamedTuple):
     """Empty fields of readings."""
     why: str = ""
     """Reason why it is dropped."""
-
-
-def reach(signal: Signal, dt: float) -> float:
-    """Largest distance of neighbours between which values are interpolated [s]."""
-    widest_gap = 2.5  # intervals of a topic between neighbours that are interpolated at most: one message may be lost
-    return max(widest_gap * signal.interval, dt)
 
 
 def longest_silence(signal: Signal, dt: float, declared: float | None) -> float:

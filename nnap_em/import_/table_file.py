@@ -25,7 +25,7 @@ from ..data.formats import (
     unreadable,
     untimed,
 )
-from ..data.units import clock_of, is_episode, named_unit
+from ..data.units import UNITS, clock_of, is_episode, named_unit
 from .clock import in_a_row, nanoseconds, rising
 from .recording import EXTRA, SECOND, UNTIMED, Recording, Topic, Track
 from .text_file import CODESYS, layout, plain
@@ -56,8 +56,9 @@ class Block(NamedTuple):
         if self.unit == "ticks" and isinstance(table, TextTable):
             every = zip(table.texts(clock), t, strict=True)
             return np.array([100 * (int(text if text.isdecimal() else x) - _TICKS_1970) for text, x in every])
+        unit = clock.lower() if clock.lower() in UNITS else named_unit(clock)[1]
         days = (lambda: columns_of(table, (self.day or "",), dates=True)[:, 0]) if self.day else None
-        return nanoseconds(table.path, f"column {clock!r}", t, self.unit or named_unit(clock)[1], days)
+        return nanoseconds(table.path, f"column {clock!r}", t, self.unit or unit, days)
 
     def track(self, names: Sequence[str]) -> Track:
         """Some of the columns at their times."""

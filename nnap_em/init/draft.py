@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from ..data.dataset import DataError
 from ..data.formats import header_hint
@@ -16,7 +16,7 @@ from ..data.table import toml_key, toml_text
 from ..data.units import named_unit, parameter_unit, si
 from ..import_.files import read, reader
 from ..import_.recording import UNTIMED, Address, Topic, last_word, places
-from ..import_.signals import Signal, interpolated, reach
+from ..import_.signals import Signal, interpolated
 
 _NAMES = {  # what people call a column, its number apart
     "time": re.compile(r"_*(time|t|timestamp|clock)()$"),
@@ -110,7 +110,7 @@ def drafted(
         *(driven({column: joint for column, (_, joint) in inputs.items()}) if drives is None else drives),
         *sampling(table),
         *_measurement(table, list(readings), states, unit),
-        *_addresses(topics, columns),
+        *addresses(topics, columns),
     ]
     return Draft("\n".join([HEAD.format(name=toml_text(name)), *lines]) + "\n")
 
@@ -196,11 +196,15 @@ def columns_table(path: Path, columns: Mapping[str, Address]) -> dict[str, Float
     """The columns on the rows of the fastest topic, for a look at interval and noise; NaN where no reading is near."""
     tracks = read(path, columns.values()).tracks
     origin = max(int(track.t[0]) for track in tracks.values())
-    steps = [np.median(np.diff(track.t)) * 1e-9 for track in tracks.values() if track.t.size > 1]
+    read_at = [tracks[at.topic].t[np.isfinite(tracks[at.topic].values[at.path])] for at in columns.values()]
+    steps = [common_step(t) for t in read_at if t.size > 1]
     if not steps:
         raise DataError(f"{path}: its topics have one message each; give a log of a motion")
-    dt = float(f"{min(steps):.3g}")
-    dt = dt if abs(dt / min(steps) - 1) < 1e-4 or "" not in tracks else float(f"{min(steps):.6g}")
+    rows = [common_step(track.t) for track in tracks.values() if track.t.size > 1]
+    # Columns that are read in turns share the step of the rows, those a little later than others do not
+    step, error = min(step for step in (*steps, *rows) if step[0] > 0.4 * min(steps)[0])
+    dt = float(f"{step:.3g}")
+    dt = dt if abs(dt - step) < max(1e-4 * step, error) or "" not in tracks else float(f"{step:.6g}")
     end = min(int(track.t[-1]) for track in tracks.values())
     most = 100_000  # rows of the log from which its interval and noise are estimated
     at = dt * np.arange(min(max(round((end - origin) * 1e-9 / dt), 0), most))
@@ -215,8 +219,24 @@ def columns_table(path: Path, columns: Mapping[str, Address]) -> dict[str, Float
         y = track.values[place.path]
         t, y = (track.t - origin)[np.isfinite(y)] * 1e-9, y[np.isfinite(y)]
         signal = Signal(place.topic, t, (place.scale or 1.0) * y)
-        table[name] = interpolated(signal, at, dt, reach(signal, dt)) if y.size > 1 else np.full(at.size, np.nan)
+        table[name] = interpolated(signal, at, dt) if y.size > 1 else np.full(at.size, np.nan)
     return table
+
+
+def common_step(t: Int[np.ndarray, " row"]) -> tuple[float, float]:
+    """Interval [s] of which the steps of times [ns] are multiples, but for jitter, and three standard errors of it.
+
+    Without such an interval, the median.
+    """
+    steps, scatter = 1e-9 * np.diff(t), 0.15  # mean distance from multiples, a quarter where there are none [intervals]
+    usual = float(np.quantile(steps, 0.5, method="nearest"))
+    steps = steps[steps < 10 * usual]  # no pause
+    for part in range(1, 9):
+        count = np.round(steps * part / usual)
+        step = float(steps.sum() / count.sum())
+        if np.mean(np.abs(steps / step - count)) < scatter:
+            return step, 3 * float(np.std(steps - count * step)) / float(count.sum())
+    return usual, 0.0
 
 
 # --- lines
@@ -247,12 +267,12 @@ def driven(inputs: Mapping[str, str], joints: bool = True) -> Iterator[str]:
         yield f"{mark}joints = {places}    # the joint that each drives, by name or counted from 1; such as [1]"
 
 
-def sampling(table: Mapping[str, np.ndarray]) -> Iterator[str]:
-    """The interval of the rows, where they have times, and the clock."""
+def sampling(table: Mapping[str, np.ndarray], slow: float = SLOW) -> Iterator[str]:
+    """The interval of the rows, where they have times, and the clock, which above `slow` [s] is in doubt."""
     yield from ("", "[sampling]")
     t = table.get("time", np.zeros(2))
     dt = float(f"{t[1] - t[0]:.6g}")
-    doubt = "; is the clock in ms?" if dt > SLOW else ""
+    doubt = "; is the clock in ms?" if dt > slow else ""
     yield f"dt = {dt!r}    # s{doubt}" if dt else "# dt = ...    # s; the rows of this log have no times"
     yield 'input_hold = "zero-order"    # of commands; "first-order" of a measured torque, current or force'
     clock = "sequence" if abs(t[0]) <= 0.01 * dt else "session"
@@ -277,7 +297,7 @@ def _measurement(
             yield f"# {toml_key(name)} = {{ mean = 0.0, std = 0.5 }}    # {unit(name)}; may be left out"
 
 
-def _addresses(topics: Sequence[Topic], columns: Mapping[str, Address]) -> Iterator[str]:
+def addresses(topics: Sequence[Topic], columns: Mapping[str, Address]) -> Iterator[str]:
     """Addresses of columns that have another name in the log, after what is not used: topics, or columns of tables."""
     lines = [f"{toml_text(name)} = {at.toml}" for name, at in columns.items() if at != Address("", name)]
     if lines:

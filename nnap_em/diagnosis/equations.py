@@ -17,12 +17,12 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Bool, Float
 
 from ..data.dataset import Dataset
+from ..data.noise import fast_reading_noise
 from ..effects import AbstractEffect, Candidate, SearchScales, SensorEffect, catalogue, fields, flat
 from ..effects.actuator import DriveEffect, MotorGain
 from ..effects.equations import STRONG, InputBias, SignalEffect, lean, numbered
 from ..em import simulated
 from ..em.equations import free_term, motion
-from ..em.readings import reading_noise
 from ..fit.identify import Identified, fitted_to_horizon
 from ..model.state_space import with_effects
 from ..storage.deadline import TimeUp, late
@@ -179,7 +179,7 @@ class Search(NamedTuple):
         smallest of that of EM, that in the logs and that in the errors, half their mean square change from one to the
         next [von Neumann 1941, Annals of Mathematical Statistics 12(4), 367]: the last two hold a part of what is fast.
         """
-        logs = np.array([reading_noise(y) for y in np.moveaxis(np.asarray(self.data.y), -1, 0)])
+        logs = np.array([fast_reading_noise(y) for y in np.moveaxis(np.asarray(self.data.y), -1, 0)])
         change = np.ma.mean(np.diff(np.ma.masked_invalid(of.error), axis=2) ** 2, axis=(0, 1, 2)) / 2
         every = np.exp(np.asarray(self.before.model.log_r)), logs**2, np.ma.filled(change, np.inf)
         return 1 - float(np.mean(np.min(every, axis=0) / self.scale**2))

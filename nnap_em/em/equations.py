@@ -13,6 +13,7 @@ from scipy.optimize import least_squares
 
 from ..data.dataset import Dataset
 from ..data.logs import Logs
+from ..data.noise import fast_reading_noise
 from ..data.rig import SMOOTH, Rig
 from ..effects.equations import NODES, UnknownTerm
 from ..model.friction import NoFriction
@@ -22,7 +23,6 @@ from ..numerics.gaussian import Gaussian
 from ..numerics.parallel import each
 from ..systems.equations import Equations
 from .prior import ParameterPrior, declared_prior
-from .readings import reading_noise
 from .simulated import filter_path
 
 
@@ -264,7 +264,7 @@ def build_equations(rig: Rig, system: Equations, data: Dataset):
     start, learned = start_prior(rig, system, data)
     count, ports = len(system.states), len(system.ports)
     noise = [rig.noise_std.get(n) for n in rig.measured]
-    least = [max(reading_noise(np.asarray(data.y)[..., i]), 1e-9) for i in range(len(rig.measured))]
+    least = [max(fast_reading_noise(np.asarray(data.y)[..., i]), 1e-9) for i in range(len(rig.measured))]
     model = StateSpaceModel(
         system=system,
         unknown=NoFriction(jnp.ones(ports), jointless=True),

@@ -114,17 +114,14 @@ def together(
     at, count = windows(models[0], data), len(data.t)
     numbers = [eqx.filter((m, p, p.read(m)), eqx.is_array) for m, p in zip(models, priors, strict=True)]
     static = eqx.filter((models[0], priors[0], jnp.zeros(0)), eqx.is_array, inverse=True)
-    out = []
-    groups = (1, 4, 16, 64)  # models at once, a program for each number; copies of the last model fill one up
-    for first in range(0, len(models), groups[-1]):
-        some, begun = numbers[first : first + groups[-1]], list(starts[first : first + groups[-1]])
-        size = next(size for size in groups if size >= len(some))
-        filled = [*some, *some[-1:] * (size - len(some))]
-        stacked = jax.tree.map(lambda *a: np.repeat(np.stack(list(map(np.asarray, a))), count, axis=0), *filled)
-        tiled = jax.tree.map(lambda a, size=size: np.concatenate([np.asarray(a)] * size), (tuple(data), begin.mean))
-        begun = np.concatenate([*begun, *begun[-1:] * (size - len(begun))])
-        batch = stacked, Dataset(*tiled[0]), tiled[1], begun
-        out_of = begun, *each(_errors, (static, at, begin.width), batch)
+    out, most, sizes = [], 64, (4, 16, 64)  # models, and simulations at once, of which few sizes need few programs
+    for first in range(0, len(models), most):
+        some, begun = numbers[first : first + most], np.concatenate(starts[first : first + most])
+        stacked = jax.tree.map(lambda *a: np.repeat(np.stack(list(map(np.asarray, a))), count, axis=0), *some)
+        copies = np.tile(np.arange(count), len(some))
+        logs, mean = jax.tree.map(lambda a, copies=copies: np.asarray(a)[copies], (data, begin.mean))
+        size = max(size for size in sizes if size <= max(len(begun), sizes[0]))
+        out_of = begun, *each(_errors, (static, at, begin.width), (stacked, logs, mean, begun), group=size)
         for i, (_, _, z) in enumerate(some):
             values = (np.asarray(a[i * count : (i + 1) * count]) for a in out_of)
             out.append(Simulated(models[first + i], priors[first + i], np.asarray(z), *values))

@@ -63,7 +63,8 @@ def use_every_device() -> None:
 
 
 GROUP = 4
-"""Entries on which a device of the processor works at once, so that one program serves any number of them.
+"""Entries on which a device of the processor works at once, so that one program serves any number of them: long work,
+whose start costs nothing beside it.
 
 All of 20 sequences at once are smoothed in four fifths of the time, and compiled anew for every number.
 """
@@ -74,12 +75,12 @@ def few_sizes(count: int) -> int:
     return 1 << max(5, (count - 1).bit_length())
 
 
-def each(function: Callable, common: Any, batch: Any, *, together: int | None = None) -> Any:
+def each(function: Callable, common: Any, batch: Any, *, together: int | None = None, group: int = GROUP) -> Any:
     """`function(common, one)` for every entry `one` along the first axis of the arrays in `batch`, as many as the first
     of these has.
 
     Compiled, and cached by `function`, which therefore stands at the top of its module.  At most `together` entries
-    are worked on at once by each device; without it, on an accelerator, all are.
+    are worked on at once by each device; without it, on an accelerator, all are, and on a processor a `group`.
     """
     count = next(leaf for leaf in jax.tree.leaves(batch) if eqx.is_array_like(leaf)).shape[0]
     if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((common, batch))):  # part of a larger program
@@ -88,9 +89,11 @@ def each(function: Callable, common: Any, batch: Any, *, together: int | None = 
     share = -(-count // (1 if mesh is None else mesh.size))
     if mesh is not None and jax.process_count() == 1:  # no more devices than have work
         mesh = Mesh(mesh.devices[: -(-count // share)], mesh.axis_names)
-    group, on_processor = min(together or share, share), jax.default_backend() == "cpu"
-    if on_processor:
-        group = min(together or GROUP, GROUP, 1 << (share - 1).bit_length())
+    on_processor = jax.default_backend() == "cpu"
+    if not on_processor:
+        group = min(together or share, share)
+    else:
+        group = min(together or group, group, 1 << (share - 1).bit_length())
     at_once = group * (1 if mesh is None else mesh.size)
     program, parts = _program(function), []
     common = on_default_device(common) if mesh is None else _place(common, NamedSharding(mesh, P()))

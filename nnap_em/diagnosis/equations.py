@@ -360,7 +360,10 @@ def _round(search: Search, hypothesis: Hypothesis, rows: int) -> Round:
         suspects = tuple(Suspect(case.keys[0], case.share, math.nan) for case in near[:4])
         return Round(step._replace(suspects=suspects), complete=complete)
     best, alike, tied = _chosen(passing)
-    if rivals := [case for case in alike if len(case.laws) == 1 and case.places.isdisjoint(best.places)]:
+    apart = lambda case: len(case.laws) == 1 and case.places.isdisjoint(best.places)  # noqa: E731
+    if any(case.numbers <= best.numbers and apart(case) for case in alike):
+        best, *alike = _ahead(search, bare, alike, singles, parts[0])
+    if rivals := [case for case in alike if case.numbers <= best.numbers and apart(case)]:
         keys = tuple(key for case in (best, *rivals) for key in case.keys)
         search.log(f"  cannot tell: {', '.join(map(words, keys))} explain the same; none is added")
         return Round(step._replace(rivals=keys), complete=complete)
@@ -383,6 +386,27 @@ def _ranked(cases: Iterable[Case]) -> list[Case]:
 def _first(singles: Sequence[Case]) -> list[Case]:
     """Gains and biases of inputs, which are judged whatever they explain."""
     return [case for case in singles if isinstance(case.laws[0].start, MotorGain | InputBias)]
+
+
+def _ahead(search: Search, bare: Hypothesis, laws: Sequence[Case], singles: Sequence[Case], null: Cells) -> list[Case]:
+    """Cases that explain the same, the best first, without those that leave more once a further law is with each; from
+    all starts of laws, of which many are near a better one by themselves.
+    """
+    least = []
+    for case in laws:
+        starts = [case.effects, *(law.probes[:1] for law in search.every if (key_of(law.start),) == case.keys)]
+        others = [other for other in singles[:PARTNERS] if other.keys[0] not in case.keys]
+        pairs = [((*case.laws, *other.laws), (*start, *other.effects)) for other in others for start in starts]
+        pairs = [pair for pair in search.screened(bare, pairs, PAIRS_JUDGED) if pair.sound][:SHORTLIST]
+        least.append(min(search.judged(bare, pairs, null), key=lambda pair: pair.left, default=case))
+    top = min(least, key=lambda case: case.left)
+    order = sorted(range(len(laws)), key=lambda i: least[i].left)
+    return [laws[i] for i in order if _as_likely(least[i], top) or EQUIVALENT * least[i].left <= top.left]
+
+
+def _as_likely(case: Case, top: Case) -> bool:
+    """True where a case is as likely as the best on parts left out."""
+    return 0.5 * simulated.independent(top.of) * math.log(case.left / top.left) < EQUIVALENT_NATS
 
 
 def _rivals(search: Search, bare: Hypothesis, best: Case, singles: Sequence[Case], whole: float) -> list[Case]:
@@ -420,16 +444,13 @@ def _certain(case: Case) -> bool:
 
 
 def _chosen(passing: Sequence[Case]) -> tuple[Case, list[Case], list[Case]]:
-    """The case of the fewest numbers among those that explain the same as the best; others of as few numbers among
-    these, and all that are worth as much and leave as much. What explains the same is worth as much, and as likely on
-    parts left out: few errors make much likely, and of a law that removes nearly all the rest counts.
+    """The case of the fewest numbers among those that explain the same as the best; all of these; and those, too, that
+    are worth as much and leave as much. What explains the same is worth as much, and as likely on parts left out: few
+    errors make much likely, and of a law that removes nearly all the rest counts.
     """
     worths = [case.worth for case in passing]
     top = passing[int(np.argmax(worths))]
-    errors = simulated.independent(top.of)
-    nats = [0.5 * errors * math.log(case.left / top.left) for case in passing]  # likelihood that each loses to the best
-    alike = [passing[i] for i in even(worths) if nats[i] < EQUIVALENT_NATS]
+    alike = [passing[i] for i in even(worths) if _as_likely(passing[i], top)]
     best = min(alike, key=lambda case: (case.numbers, case.left))
-    as_few = [case for case in alike if case is not best and case.numbers <= best.numbers]
     rest = [case for case in (passing[i] for i in even(worths)) if EQUIVALENT * case.left <= top.left]
-    return best, as_few, [case for case in passing if any(case is other for other in (*alike, *rest))]
+    return best, alike, [case for case in passing if any(case is other for other in (*alike, *rest))]

@@ -106,7 +106,7 @@ class LateLaw(AbstractEffect):
         return dataclasses.replace(self, sensors=self.sensors[:, index])
 
     def reading(self, value, past):
-        return past(self.seconds * self.sensors[0])
+        return jnp.where(self.sensors[0] > 0, past(self.seconds), value)  # the same for all, so that it is done once
 
 
 def lean(effect: AbstractEffect, system: Any) -> AbstractEffect:

@@ -85,32 +85,47 @@ class PlantLaw(AbstractEffect):
         return (1 + scale) * value + bias + bend * (value - self.level) ** 2 / jnp.where(self.edge > 0, self.edge, 1.0)
 
 
-class LateLaw(AbstractEffect):
-    """A delay of an input, a lag of an input, or a delay of readings, by zeros and ones."""
+class OtherLaw(AbstractEffect):
+    """A delay of an input, a lag of an input, a delay of readings, or parameters k of the plant, times
+    1 + number (p - middle), by zeros and ones; p is the signal that `pick` picks.
+    """
 
-    meaning: ClassVar[str] = "A law of equations that takes time."
+    meaning: ClassVar[str] = "A law of equations that takes time, or a parameter that is none."
     confirm: ClassVar[str] = "Make a step."
-    seconds: Scalar
+    number: Scalar
     inputs: Float[Array, "2 *input"] = known()
     sensors: Float[Array, "1 *readable"] = known()
+    which: Float[Array, " parameter"] = known()
+    pick: Float[Array, " signal"] = known()
+    middle: Any = known()
+    late: Any = known()
+    """1 where some reading is late."""
 
     def at_drive(self, place, index):
         return dataclasses.replace(self, inputs=self.inputs[:, index])
 
     def input(self, u, dt):
         delay, lag = self.inputs
-        late = InputDelay(self.seconds * delay, channel="").input(u, dt)
-        return jnp.where(lag > 0, ActuatorLag(self.seconds, channel="").input(u, dt), late)
+        late = InputDelay(self.number * delay, channel="").input(u, dt)
+        return jnp.where(lag > 0, ActuatorLag(self.number * lag, channel="").input(u, dt), late)
 
     def at_reading(self, name, index):
         return dataclasses.replace(self, sensors=self.sensors[:, index])
 
     def reading(self, value, past):
-        return jnp.where(self.sensors[0] > 0, past(self.seconds), value)  # the same for all, so that it is done once
+        return jnp.where(self.sensors[0] > 0, past(self.number * self.late), value)  # the same for all: done once
+
+    def force(self, scene, memory):
+        system, still = scene.system, jnp.zeros_like(scene.drive)
+        moved = self.number * self.which * (self.pick @ jnp.concatenate([scene.q, cast(Array, scene.u)]) - self.middle)
+        numbers = zip(system.of.parameters, moved, strict=True)
+        changed = system.with_parameters({name: system.values[name] * (1 + more) for name, more in numbers})
+        rates = (jnp.stack(one.slopes(scene.q, scene.v, scene.u, still)) for one in (changed, system))
+        return still.at[: len(system.states)].set(next(rates) - next(rates))
 
 
 def lean(effect: AbstractEffect, system: Any) -> AbstractEffect:
-    """A law as a `PlantLaw` or a `LateLaw`, so that one program serves all; itself where it has a form of its own."""
+    """A law as a `PlantLaw` or an `OtherLaw`, so that one program serves all; itself where it has a form of its own."""
     if type(effect) not in PLACES:
         return effect.lean(system)
     kind, at, place = PLACES[type(effect)]
@@ -118,9 +133,10 @@ def lean(effect: AbstractEffect, system: Any) -> AbstractEffect:
     of = {"inputs": jnp.zeros((4, len(system.inputs))), "sensors": jnp.zeros((3, len(system.readable)))}
     here = _one_of({"inputs": system.inputs, "sensors": system.readable}[at], effect.channel)
     of[at] = of[at].at[place].set(jnp.ones_like(here) if effect.channel == "all" else here)
-    if kind is LateLaw:
-        return LateLaw(first, of["inputs"][:2], of["sensors"][:1])
     signals, ports = jnp.zeros(len(system.states) + len(system.inputs)), jnp.zeros(len(system.ports))
+    if kind is OtherLaw:
+        which, late = jnp.zeros(len(system.of.parameters)), a(float(at == "sensors"))
+        return OtherLaw(first, of["inputs"][:2], of["sensors"][:1], which, signals, a(0.0), late)
     rest = jnp.zeros(len(FORMS)), signals, signals, ports, ports, getattr(effect, "range", a(0.0))
     return PlantLaw(first, (*inner, none)[0], none, of["inputs"], of["sensors"], *rest)
 
@@ -414,25 +430,6 @@ class Overflow(FullEffect):
         return f"an overflow of {self.channel} into {self.to} above {sizes['level']} (share {sizes['share']})"
 
 
-class Varied(AbstractEffect):
-    """Parameters k of the plant, times 1 + slope (p - middle) where `which` is 1; p the signal that `pick` picks."""
-
-    meaning: ClassVar[str] = "A parameter that changes."
-    confirm: ClassVar[str] = "Change the signal alone."
-    slope: Scalar
-    which: Float[Array, " parameter"] = known()
-    pick: Float[Array, " signal"] = known()
-    middle: Any = known()
-
-    def force(self, scene, memory):
-        system, still = scene.system, jnp.zeros_like(scene.drive)
-        moved = self.slope * self.which * (self.pick @ jnp.concatenate([scene.q, cast(Array, scene.u)]) - self.middle)
-        numbers = zip(system.of.parameters, moved, strict=True)
-        changed = system.with_parameters({name: system.values[name] * (1 + more) for name, more in numbers})
-        rates = (jnp.stack(one.slopes(scene.q, scene.v, scene.u, still)) for one in (changed, system))
-        return still.at[: len(system.states)].set(next(rates) - next(rates))
-
-
 class VaryingParameter(SignalEffect):
     """k (1 + slope (p - middle)) in the place of a parameter k, `middle` in the range of the signal p."""
 
@@ -442,14 +439,13 @@ class VaryingParameter(SignalEffect):
     middle: Any = known(kw_only=True)
 
     def lean(self, system):
-        which, pick = (
-            _one_of(system.of.parameters, self.channel),
-            _one_of((*system.states, *system.inputs), *self.reads),
-        )
-        return Varied(self.slope, which, pick, self.middle)
+        signals = (*system.states, *system.inputs)
+        which, pick = _one_of(system.of.parameters, self.channel), _one_of(signals, *self.reads)
+        inputs, sensors = jnp.zeros((2, len(system.inputs))), jnp.zeros((1, len(system.readable)))
+        return OtherLaw(self.slope, inputs, sensors, which, pick, self.middle, a(0.0))
 
     def with_numbers(self, lean):
-        return eqx.tree_at(lambda e: e.slope, self, cast(Varied, lean).slope)
+        return eqx.tree_at(lambda e: e.slope, self, cast(OtherLaw, lean).number)
 
     def values(self):
         return {"slope": self.slope}
@@ -601,7 +597,7 @@ class UnknownTerm(SignalEffect):
 PLACES: dict[type[AbstractEffect], tuple[type[AbstractEffect], str, int]] = {
     MotorGain: (PlantLaw, "inputs", 0), InputBias: (PlantLaw, "inputs", 1), DeadZone: (PlantLaw, "inputs", 2),
     Saturation: (PlantLaw, "inputs", 3), SensorScale: (PlantLaw, "sensors", 0), SensorBias: (PlantLaw, "sensors", 1),
-    Bend: (PlantLaw, "sensors", 2), InputDelay: (LateLaw, "inputs", 0), ActuatorLag: (LateLaw, "inputs", 1),
-    SensorDelay: (LateLaw, "sensors", 0),
+    Bend: (PlantLaw, "sensors", 2), InputDelay: (OtherLaw, "inputs", 0), ActuatorLag: (OtherLaw, "inputs", 1),
+    SensorDelay: (OtherLaw, "sensors", 0),
 }  # fmt: skip
 """Laws of inputs and readings: the form that each has in common with others, and its place there."""

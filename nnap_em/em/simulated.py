@@ -114,14 +114,13 @@ def together(
     at, count = windows(models[0], data), len(data.t)
     numbers = [eqx.filter((m, p, p.read(m)), eqx.is_array) for m, p in zip(models, priors, strict=True)]
     static = eqx.filter((models[0], priors[0], jnp.zeros(0)), eqx.is_array, inverse=True)
-    out, most, sizes = [], 64, (4, 16, 64)  # models, and simulations at once, of which few sizes need few programs
+    out, most, group = [], 64, 16  # models, and simulations at once: of more a step takes as long
     for first in range(0, len(models), most):
         some, begun = numbers[first : first + most], np.concatenate(starts[first : first + most])
         stacked = jax.tree.map(lambda *a: np.repeat(np.stack(list(map(np.asarray, a))), count, axis=0), *some)
         copies = np.tile(np.arange(count), len(some))
         logs, mean = jax.tree.map(lambda a, copies=copies: np.asarray(a)[copies], (data, begin.mean))
-        size = max(size for size in sizes if size <= max(len(begun), sizes[0]))
-        out_of = begun, *each(_errors, (static, at, begin.width), (stacked, logs, mean, begun), group=size)
+        out_of = begun, *each(_errors, (static, at, begin.width), (stacked, logs, mean, begun), group=group)
         for i, (_, _, z) in enumerate(some):
             values = (np.asarray(a[i * count : (i + 1) * count]) for a in out_of)
             out.append(Simulated(models[first + i], priors[first + i], np.asarray(z), *values))

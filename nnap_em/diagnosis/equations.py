@@ -169,9 +169,10 @@ class Search(NamedTuple):
         out = []
         for i, left in self.left_out(hypothesis, cases).items():
             before, after = (cells[:, 1:].sum(axis=(1, 2)) for cells in (null, left))
-            gains = tuple(1 - after / np.maximum(before, 1e-12))
-            share = 1 - after.sum() / max(before.sum(), 1e-12)
-            out.append(cases[i]._replace(share=share, left=after.sum(), folds=gains, harms=worsens(null, left)))
+            gains = tuple((1 - after / np.maximum(before, 1e-12)).tolist())
+            total = float(after.sum())
+            share = 1 - total / max(float(before.sum()), 1e-12)
+            out.append(cases[i]._replace(share=share, left=total, folds=gains, harms=worsens(null, left)))
         return out
 
     def room(self, of: simulated.Simulated) -> float:

@@ -243,7 +243,9 @@ def test_what_is_as_good_in_the_place_of_a_law_is_told():
     key = equations.key_of
     assert equations._in_place_of(key(a), cases[0], cases) == (key(b),)
     assert equations._in_place_of(key(c), cases[0], cases) == (key(b),)
-    assert cases[0].places == {"a", "u"} and cases[2].places == {"a"}
+    system = Equations({}, json.dumps(PLANT | {"readings": {"y": "a", "z": "2*b"}}))
+    bias = of._replace(laws=(Candidate(catalogue["sensor_bias"].of(0.0, channel="y"), (), c),))
+    assert cases[0].places(system) == {"a", "u"} and bias.places(system) == {"y", "a"}
 
 
 def test_the_common_form_of_a_free_function_is_the_same_function():

@@ -88,10 +88,10 @@ class Case(NamedTuple):
         """Their names."""
         return tuple(key_of(law.start) for law in self.laws)
 
-    @property
-    def places(self) -> set[str | None]:
-        """Ports, inputs and readings where they are, and signals of which they are functions."""
-        return {name for key in self.keys for name in (key[2], *key[3])}
+    def places(self, system: Any) -> set[str | None]:
+        """Ports, inputs and readings where they are, signals of which they are functions, states that readings have."""
+        names = {name for key in self.keys for name in (key[2], *key[3])}
+        return names | {state for name in names if name in system.sensors and (state := system.state_of(name))}
 
 
 class Search(NamedTuple):
@@ -361,7 +361,8 @@ def _round(search: Search, hypothesis: Hypothesis, rows: int) -> Round:
         suspects = tuple(Suspect(case.keys[0], case.share, math.nan) for case in near[:4])
         return Round(step._replace(suspects=suspects), complete=complete)
     best, alike, tied = _chosen(passing)
-    apart = lambda case: len(case.laws) == 1 and case.places.isdisjoint(best.places)  # noqa: E731
+    places = lambda case: case.places(bare.model.system)  # noqa: E731
+    apart = lambda case: len(case.laws) == 1 and places(case).isdisjoint(places(best))  # noqa: E731
     if any(case.numbers <= best.numbers and apart(case) for case in alike):
         best, *alike = _ahead(search, bare, alike, singles, parts[0])
     if rivals := [case for case in alike if case.numbers <= best.numbers and apart(case)]:

@@ -246,6 +246,8 @@ def test_what_is_as_good_in_the_place_of_a_law_is_told():
     system = Equations({}, json.dumps(PLANT | {"readings": {"y": "a", "z": "2*b"}}))
     bias = of._replace(laws=(Candidate(catalogue["sensor_bias"].of(0.0, channel="y"), (), c),))
     assert cases[0].places(system) == {"a", "u"} and bias.places(system) == {"y", "a"}
+    law = catalogue["varying_parameter"](slope=0.0, middle=1.0, channel="k", reads=("u",))
+    assert of._replace(laws=(Candidate(law, (), law),)).places(system) == {"k", "u", "b", "a"}
 
 
 def test_the_common_form_of_a_free_function_is_the_same_function():

@@ -91,6 +91,7 @@ class Case(NamedTuple):
     def places(self, system: Any) -> set[str | None]:
         """Ports, inputs and readings where they are, signals of which they are functions, states that readings have."""
         names = {name for key in self.keys for name in (key[2], *key[3])}
+        names |= {name for parameter in names & {*system.of.parameters} for name in system.beside(parameter)}
         return names | {state for name in names if name in system.sensors and (state := system.state_of(name))}
 
 

@@ -151,6 +151,11 @@ class Equations(AbstractPlant):
         values = self.named(q, u, push)
         return tuple(jnp.asarray(formula.of(values), q.dtype) for formula in _formulas(self.text)[1])
 
+    def beside(self, parameter: str) -> set[str]:
+        """States whose rates hold a parameter, and all names beside it there; none of a Python function."""
+        rates = zip(self.of.states, _formulas(self.text)[0], strict=False)
+        return {name for state, rate in rates if parameter in rate.names for name in (state, *rate.names)}
+
     def state_of(self, column: str) -> str | None:
         """The state that a column reads as it is; None where it reads something else."""
         formula = self.of.readings.get(column, column)

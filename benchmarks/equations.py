@@ -109,7 +109,9 @@ CASES = {
     "lag": Case("heaters", (("Q1", set()),), lag=40.0),
     "bend": Case("tanks", (("y", set()),), reading=lambda x: x + 0.3 * (x - 2) ** 2 / 6),
     "f(x1, u)": Case(
-        "heaters", (("T1", {"T1", "Q1"}),), lambda x, u: [-0.007 * u[0] * x[0] ** 2 / (x[0] ** 2 + 60.0**2), 0.0]
+        "heaters",
+        (("T1", {"T1", "Q1"}), ("a1", {"T1"})),
+        lambda x, u: [-0.007 * u[0] * x[0] ** 2 / (x[0] ** 2 + 60.0**2), 0.0],
     ),
 }
 NULL, PLANTED = ("tanks", "motor"), tuple(name for name in CASES if name not in ("tanks", "motor"))

@@ -84,7 +84,7 @@ CASES = {
     "model_car": _stored("model_car"),
     "heaters": _heaters,
 }
-"""What writes each data set."""
+"""Functions that write the data sets."""
 
 
 def run(name: str, out: Path, core: int) -> str:

@@ -169,7 +169,7 @@ def test_a_strength_that_is_not_determined_is_refused():
 
 
 def test_noise_of_readings_is_no_room_for_laws():
-    """Of unit noise and a sine; of one of nine rows a period the noise that EM found tells the two apart."""
+    """Room is the share of a sine beside unit noise; at nine rows a period EM's noise alone shows it."""
     rng, row, data = np.random.default_rng(0), np.arange(400), _logs(0.0)
     for amplitude, period, em, room in ((0.0, 126, 9.0, 0.0), (2.0, 126, 9.0, 2 / 3), (2.0, 9, 1.0, 2 / 3)):
         error = rng.standard_normal((1, 1, 400, 1)) + amplitude * np.sin(2 * np.pi * row / period)[:, None]
@@ -192,7 +192,7 @@ def test_laws_that_make_a_reading_worse_at_some_age_are_refused():
 
 
 def test_each_law_of_a_pair_is_tried_in_the_place_of_the_other():
-    """Of the pair a, c other laws take the place of either; those that explain nine tenths of what it does are told."""
+    """Rivals of a pair have another law in the place of one, and explain nine tenths of what it does."""
     system = Equations({}, json.dumps(PLANT))
     names, key = ("linear_flow", "square_flow", "cubic_flow"), equations.key_of
     flows = [catalogue[name](strength=0.0, channel="a", reads=("a",)) for name in names]
@@ -256,7 +256,7 @@ def test_the_common_form_of_a_free_function_is_the_same_function():
     term = UnknownTerm(jnp.arange(7.0), basis, np.zeros(2), np.full(2, 4.0), channel="b", reads=("b", "u"))
     form = term.lean(system)
     np.testing.assert_allclose(_pushes(form), _pushes(term), rtol=1e-12)
-    np.testing.assert_array_equal(term.with_numbers(form).weights, term.weights)
+    np.testing.assert_array_equal(numbered(term, form).weights, term.weights)
 
 
 def test_the_table_of_an_unknown_term_has_its_values_and_their_spread():

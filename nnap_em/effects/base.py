@@ -253,14 +253,6 @@ class AbstractEffect(eqx.Module):
         """True for a free function of an input, which under feedback correlates with any disturbance."""
         return False
 
-    def lean(self, system: Any) -> "AbstractEffect":
-        """The law as a formula that it shares with others, so that one program serves all; itself without one."""
-        return self
-
-    def with_numbers(self, lean: "AbstractEffect") -> "AbstractEffect":
-        """The law with the numbers of its `lean` form."""
-        return lean
-
     def at_drive(self, place: Mapping[str, Any], index: int) -> "AbstractEffect | None":
         """The law as it is at one drive; None where it does nothing."""
         return self if all(getattr(self, key) == value for key, value in place.items()) else None

@@ -6,6 +6,7 @@ Each is a `Flow`: one formula for all of them, so that a search compiles one pro
 import dataclasses
 import itertools
 import math
+from abc import abstractmethod
 from collections.abc import Sequence
 from functools import partial
 from typing import Any, ClassVar, cast
@@ -57,6 +58,14 @@ class PlantLaw(AbstractEffect):
     target: Float[Array, " port"] = known()
     edge: Any = known()
 
+    @classmethod
+    def nothing(cls, system: Any) -> "PlantLaw":
+        """None of the laws."""
+        inputs, sensors = jnp.zeros((4, len(system.inputs))), jnp.zeros((3, len(system.readable)))
+        signals, ports = jnp.zeros(len(system.states) + len(system.inputs)), jnp.zeros(len(system.ports))
+        none, kind = a(1e-12), jnp.zeros(len(FORMS))
+        return cls(none, none, none, inputs, sensors, kind, signals, signals, ports, ports, a(0.0))
+
     def force(self, scene, memory):
         values = jnp.concatenate([scene.q, cast(Array, scene.u)])
         p, q = self.first @ values, self.second @ values
@@ -101,6 +110,13 @@ class OtherLaw(AbstractEffect):
     late: Any = known()
     """1 where some reading is late."""
 
+    @classmethod
+    def nothing(cls, system: Any) -> "OtherLaw":
+        """None of the laws."""
+        inputs, sensors = jnp.zeros((2, len(system.inputs))), jnp.zeros((1, len(system.readable)))
+        signals = jnp.zeros(len(system.states) + len(system.inputs))
+        return cls(a(1e-12), inputs, sensors, jnp.zeros(len(system.of.parameters)), signals, a(0.0), a(0.0))
+
     def at_drive(self, place, index):
         return dataclasses.replace(self, inputs=self.inputs[:, index])
 
@@ -125,28 +141,26 @@ class OtherLaw(AbstractEffect):
 
 
 def lean(effect: AbstractEffect, system: Any) -> AbstractEffect:
-    """A law as a `PlantLaw` or an `OtherLaw`, so that one program serves all; itself where it has a form of its own."""
-    if type(effect) not in PLACES:
+    """A law in the form that it has in common with others, so that one program serves all; itself without one."""
+    if isinstance(effect, SignalEffect):
         return effect.lean(system)
-    kind, at, place = PLACES[type(effect)]
-    (first, *inner), none = (getattr(effect, name) for name in fields(effect)), a(1e-12)
-    of = {"inputs": jnp.zeros((4, len(system.inputs))), "sensors": jnp.zeros((3, len(system.readable)))}
-    here = _one_of({"inputs": system.inputs, "sensors": system.readable}[at], effect.channel)
-    of[at] = of[at].at[place].set(jnp.ones_like(here) if effect.channel == "all" else here)
-    signals, ports = jnp.zeros(len(system.states) + len(system.inputs)), jnp.zeros(len(system.ports))
-    if kind is OtherLaw:
-        which, late = jnp.zeros(len(system.of.parameters)), a(float(at == "sensors"))
-        return OtherLaw(first, of["inputs"][:2], of["sensors"][:1], which, signals, a(0.0), late)
-    rest = jnp.zeros(len(FORMS)), signals, signals, ports, ports, getattr(effect, "range", a(0.0))
-    return PlantLaw(first, (*inner, none)[0], none, of["inputs"], of["sensors"], *rest)
-
-
-def numbered(effect: AbstractEffect, lean: AbstractEffect) -> AbstractEffect:
-    """A law with the numbers of its lean form."""
     if type(effect) not in PLACES:
-        return effect.with_numbers(lean)
-    names = fields(effect)
-    values = [getattr(lean, name) for name in fields(lean)[: len(names)]]
+        return effect
+    kind, at, place = PLACES[type(effect)]
+    form = kind.nothing(system)
+    here = _one_of({"inputs": system.inputs, "sensors": system.readable}[at], effect.channel)
+    here = jnp.ones_like(here) if effect.channel == "all" else here
+    more = {"late": a(float(at == "sensors"))} if kind is OtherLaw else {"edge": getattr(effect, "range", a(0.0))}
+    form = dataclasses.replace(form, **{at: getattr(form, at).at[place].set(here)}, **more)
+    own = [getattr(effect, name) for name in fields(effect)]
+    return eqx.tree_at(lambda e: [getattr(e, name) for name in fields(form)[: len(own)]], form, own)
+
+
+def numbered(effect: AbstractEffect, form: AbstractEffect) -> AbstractEffect:
+    """A law with the numbers of the form that it has in common with others, which may have more."""
+    names, others = fields(effect), [getattr(form, name) for name in fields(form)]
+    pairs = zip((getattr(effect, name) for name in names), others, strict=False)
+    values = [other[: own.shape[0]] if own.ndim else other for own, other in pairs]
     return eqx.tree_at(lambda e: [getattr(e, name) for name in names], effect, values)
 
 
@@ -156,10 +170,14 @@ def _one_of(names: Sequence[str], name: str | None) -> Float[Array, " name"]:
 
 
 class SignalEffect(AbstractEffect):
-    """A law of some signals of equations, whose `lean` form is one formula for all."""
+    """A law of some signals of equations, which it has in a form in common with others."""
 
     reads: tuple[str, ...] = eqx.field(static=True, kw_only=True)
     """Names of its signals."""
+
+    @abstractmethod
+    def lean(self, system: Any) -> AbstractEffect:
+        """The law in that form."""
 
     def force(self, scene, memory):
         return self.lean(scene.system).force(scene, memory)
@@ -194,14 +212,9 @@ class PortEffect(SignalEffect):
         signals, ports, way = (*system.states, *system.inputs), system.ports, -1.0 if self.leaves else 1.0
         first, second = (_one_of(signals, (*self.reads, None, None)[i]) for i in (0, 1))
         source, target = way * _one_of(ports, self.channel), -way * _one_of(ports, self.to)
-        kind = np.eye(len(FORMS))[self.kind]
-        inputs, sensors = jnp.zeros((4, len(system.inputs))), jnp.zeros((3, len(system.readable)))
-        law = partial(PlantLaw, self.strength, self.level, self.share, inputs, sensors)
-        return law(kind, first, second, source, target, self.edge)
-
-    def with_numbers(self, lean):
-        numbers = lambda e: (e.strength, e.level, e.share)  # noqa: E731
-        return eqx.tree_at(numbers, self, numbers(lean))
+        kind, numbers = jnp.eye(len(FORMS))[self.kind], {name: getattr(self, name) for name in fields(self)}
+        places = {"first": first, "second": second, "source": source, "target": target}
+        return dataclasses.replace(PlantLaw.nothing(system), kind=kind, edge=self.edge, **numbers, **places)
 
     def values(self):
         return {name: getattr(self, name) for name in self.reports}
@@ -375,7 +388,7 @@ class Transfer(PortEffect):
 
 
 class FullEffect(PortEffect):
-    """What flows into the state p, less what flows out, leaves it while it is above a level and rises."""
+    """A law of a state that does not rise above a level: its net inflow leaves it there."""
 
     kind: ClassVar[int] = 6
     leaves: ClassVar[bool] = True
@@ -395,12 +408,9 @@ class FullEffect(PortEffect):
             out += [Candidate(start, (probe,), wide) for probe in levels]
         return out
 
-    def is_physical(self) -> bool:
-        return "share" not in self.reports or 0.0 < float(self.share) < 1.5
-
 
 class Ceiling(FullEffect):
-    """What flows into a state, less what flows out, is lost while it is above a level and rises."""
+    """A state loses its net inflow above a level."""
 
     meaning: ClassVar[str] = "A state does not rise above a level: a vessel that is full, a stop, a clipped value."
     confirm: ClassVar[str] = "Drive this state up slowly and watch where it stays."
@@ -416,7 +426,7 @@ class Ceiling(FullEffect):
 
 
 class Overflow(FullEffect):
-    """What flows into a state, less what flows out, enters another, or a share, while it is above a level and rises."""
+    """A state loses its net inflow above a level, and a share of it enters another."""
 
     meaning: ClassVar[str] = "A state does not rise above a level: what flows over, or a share of it, enters another."
     confirm: ClassVar[str] = "Fill the first state above the level and watch where the inflow goes."
@@ -441,11 +451,8 @@ class VaryingParameter(SignalEffect):
     def lean(self, system):
         signals = (*system.states, *system.inputs)
         which, pick = _one_of(system.of.parameters, self.channel), _one_of(signals, *self.reads)
-        inputs, sensors = jnp.zeros((2, len(system.inputs))), jnp.zeros((1, len(system.readable)))
-        return OtherLaw(self.slope, inputs, sensors, which, pick, self.middle, a(0.0))
-
-    def with_numbers(self, lean):
-        return eqx.tree_at(lambda e: e.slope, self, cast(OtherLaw, lean).number)
+        none = OtherLaw.nothing(system)
+        return dataclasses.replace(none, number=self.slope, which=which, pick=pick, middle=self.middle)
 
     def values(self):
         return {"slope": self.slope}
@@ -586,15 +593,11 @@ class UnknownTerm(SignalEffect):
         basis = jnp.pad(jnp.asarray(self.basis), [*fill, (0, 0)])
         return FreeFlow(jnp.pad(self.weights, fill, constant_values=1.0), basis, self.low, self.high, pick, at)
 
-    def with_numbers(self, lean):
-        weights = cast(FreeFlow, lean).weights[: self.weights.shape[0]]
-        return eqx.tree_at(lambda e: e.weights, self, weights)
-
     def phrase(self, sizes):
         return f"a flow into {self.channel} that depends on {' and '.join(self.reads)}"
 
 
-PLACES: dict[type[AbstractEffect], tuple[type[AbstractEffect], str, int]] = {
+PLACES: dict[type[AbstractEffect], tuple[type[PlantLaw | OtherLaw], str, int]] = {
     MotorGain: (PlantLaw, "inputs", 0), InputBias: (PlantLaw, "inputs", 1), DeadZone: (PlantLaw, "inputs", 2),
     Saturation: (PlantLaw, "inputs", 3), SensorScale: (PlantLaw, "sensors", 0), SensorBias: (PlantLaw, "sensors", 1),
     Bend: (PlantLaw, "sensors", 2), InputDelay: (OtherLaw, "inputs", 0), ActuatorLag: (OtherLaw, "inputs", 1),

@@ -545,12 +545,12 @@ a command is that of the row after
 + side="right"), 0, signal.t.size - 1)
 ## test_counters.py::test_nothing_is_interpolated_across_a_jump
 readings interpolated across the jump of a counter
-- (~across & (width <= reach))
-+ (width <= reach)
+- (~across & (near | (width <= SLOW * dt)))
++ (near | (width <= SLOW * dt))
 ## test_import.py::test_a_reading_is_interpolated_only_between_near_neighbours
 readings interpolated over a gap
-- (width <= reach)) | exact
-+ (width <= 9 * reach)) | exact
+- (near | (width <= SLOW * dt))) | exact
++ (near | (width <= 9 * SLOW * dt))) | exact
 # data/held.py
 ## test_held.py::test_an_encoder_holds_nothing
 an encoder that creeps taken for a held one

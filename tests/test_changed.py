@@ -82,7 +82,8 @@ def test_friction_that_grew_is_named_with_its_size(tmp_path):
     change = found.parameters["change"]
     assert found.effect.name == "coulomb_change"
     assert abs(change.value - GROWN) < 2 * change.std < 0.1 * GROWN
-    assert changes(closed, [found]).startswith("Changed since the fit: the Coulomb friction of joint 1 by 0.")
+    said = changes(closed, [found])  # a drift that is over within a recording explains the same
+    assert said.startswith("Changed since the fit: ") and "the Coulomb friction of joint 1 by 0." in said
     save(tmp_path / "after.npz", closed.after)
     assert float(load(tmp_path / "after.npz").model.effects[0].change) == float(found.effect.change)
     new, own = slide_logs(3, GROWN, **LONG), slide_logs(1, GROWN, **LONG)

@@ -826,6 +826,10 @@ a round that fails loses what was found
 the worst start of a law
 - return max(begun, key
 + return min(begun, key
+## test_search.py::test_a_refit_that_errs_more_than_its_start_is_not_kept
+a refit that errs more is kept
+- band=0) <= 1 else
++ band=0) <= 9 else
 ## test_loop.py::test_a_spring_is_named_and_sized_and_other_recordings_compile_nothing
 what a refit leaves counts as what it removes
 - removed = 1 - ratio(

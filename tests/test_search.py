@@ -15,7 +15,7 @@ from helpers import around, declared_model, slide
 
 from nnap_em.data.dataset import Dataset
 from nnap_em.data.rig import Declared, Rig
-from nnap_em.diagnosis import backward, diagnose, rounds, search
+from nnap_em.diagnosis import backward, diagnose, rounds, search, trial
 from nnap_em.diagnosis.context import SearchContext, chosen, lengths_of, likelier
 from nnap_em.diagnosis.hypothesis import Evidence, Hypothesis, covariances
 from nnap_em.diagnosis.keys import completed, key_of, remainder_of, replaced
@@ -283,6 +283,15 @@ def test_the_start_of_a_law_whose_step_removes_most_is_refitted():
         law = _law("dead_zone", value)
         begun.append((Trial(_zone(0.5), BARE.plus(law, _candidate(law)), share), value))
     assert leader(begun)[1] == 0.9
+
+
+def test_a_refit_that_errs_more_than_its_start_is_not_kept(monkeypatch):
+    start, end = (trial.Fitted(BARE, None, name) for name in ("start", "end"))  # type: ignore[arg-type]
+    monkeypatch.setattr(trial, "refit", lambda *_: (MODEL, None))
+    monkeypatch.setattr(trial, "begun", lambda *_: end)
+    for errs, kept in ((1.01, start), (0.99, end)):
+        monkeypatch.setattr(trial, "ratio", lambda *_, errs=errs, **__: errs)
+        assert trial.fitted(start, mock.Mock()) is kept
 
 
 def test_laws_go_without_which_too_little_is_lost_the_least_first():

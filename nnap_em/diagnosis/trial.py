@@ -63,10 +63,13 @@ def begun(hypothesis: Hypothesis, path: Gaussian, fit: SmoothedFit) -> Fitted:
 
 
 def fitted(start: Fitted, fit: SmoothedFit) -> Fitted:
-    """The same after some passes, and finished again."""
+    """The same after some passes, and finished again, unless it errs more then: passes raise the likelihood, and the
+    errors of a wild arm follow that by chance.
+    """
     hypothesis = start.hypothesis
     model, path = refit(hypothesis.model, hypothesis.m_step, start.path, fit.data, fit.used)
-    return begun(hypothesis.refitted(model), path, fit)
+    end = begun(hypothesis.refitted(model), path, fit)
+    return end if ratio(start.along, end.along, fit.used, band=0) <= 1 else start
 
 
 def null_of(fit: SmoothedFit) -> Fitted:

@@ -839,6 +839,10 @@ what a refit leaves counts as what it removes
 a law from one start
 - near = [s for s in same if s.share.least >= EQUIVALENT * law.share.least]
 + near = [law]
+## test_search.py::test_a_round[a refit shows what is left]
+forms of a law that remove nearly all explain the same
+- [-math.log1p(-value) for value in values], model
++ values, model
 # effects/position.py
 ## test_inputs.py::test_a_cogging_that_is_not_seen_to_repeat_is_none
 a bump is a cogging

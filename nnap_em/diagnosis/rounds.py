@@ -135,12 +135,13 @@ def _accepted(
     admissible: list[Trial], step: Step, model: StateSpaceModel, context: SearchContext
 ) -> tuple[Step, tuple[Trial, tuple[Key, ...]] | None]:
     """Choose among refitted laws: the simplest at the place that is worth most, in its simplest form. None where one
-    that is worth as much is of another cause, nor a free function where no error rose since a fit.
+    that is worth as much is of another cause, nor a free function where no error rose since a fit. Forms of a law are
+    compared by the log of the error without one over that with it: where nearly all goes the rest counts.
     """
     values = [case.removed for case in admissible]
     worths = _worths(admissible, values, model)
     leader = admissible[simplest(worths, _complexities(admissible, model), values)]
-    best = _form(leader, admissible, values, model)
+    best = _form(leader, admissible, [-math.log1p(-value) for value in values], model)
     law = best.candidate.start
     tied = [case for case in (admissible[i] for i in even(worths)) if case is not leader]
     rivals = [case for case in tied if other_cause(case.effect, law, model.system)]

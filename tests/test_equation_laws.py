@@ -89,17 +89,12 @@ def test_laws_of_inputs_and_readings_are_the_same_in_the_form_of_all():
 
 
 def test_laws_of_time_are_the_same_in_the_form_of_all():
-    """Delay and lag of u, delays of b and of all readings; `past` returns its delay here."""
+    """Delay and lag of u."""
     system, u = Equations({"k": jnp.ones(())}, json.dumps(PLANT)), jnp.asarray([0.0, 1.0, 3.0, 2.0, 2.0, -1.0])
     for name in ("input_delay", "actuator_lag"):
         law = catalogue[name].of(0.7, channel="u")
         late = lean(law, system).at_drive({"channel": "u"}, 0).input(u, 0.5)
         np.testing.assert_allclose(late, law.input(u, 0.5), rtol=1e-12)
-        assert lean(law, system).at_reading("b", 1).reading(5.0, float) == 5.0
-    for channel, delays in (("b", [5.0, 0.7]), ("all", [0.7, 0.7])):
-        form = lean(catalogue["sensor_delay"].of(0.7, channel=channel), system)
-        assert [float(form.at_reading("", i).reading(5.0, float)) for i in (0, 1)] == pytest.approx(delays)
-        np.testing.assert_allclose(form.at_drive({}, 0).input(u, 0.5), u, atol=1e-12)
 
 
 def test_a_parameter_that_varies_pushes_as_the_equations_with_another_one():

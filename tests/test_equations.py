@@ -282,7 +282,7 @@ def test_derivatives_of_open_loop_errors_are_those_of_differences(chain):
     still = np.zeros_like(begin_at.mean)
 
     def errors(z, start):
-        return simulated.together([prior.write(fitted.model, jnp.asarray(z))], [prior], [start], data, begin_at)[0]
+        return simulated.SideBySide([fitted.model], [prior], data, begin_at).at([0], [z], [start])[0]
 
     here = errors(np.zeros(2), still)
     assert np.isfinite(here.error).all()

@@ -6,7 +6,8 @@ recordings, and judged on these. A linear screen along smoothed paths would favo
 
 import itertools
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from typing import Any, NamedTuple, cast
 
 import equinox as eqx
@@ -37,7 +38,7 @@ from .verdict import AGREE, DETERMINED, EQUIVALENT, EQUIVALENT_NATS, MULTI_STEP,
 FOLDS, BLOCKS = 4, 16
 """Parts that are left out in turn, each of every fourth block of the rows: of twice as long ones the real tanks have
 too few with an overflow, which then explains 0.16 of what is left out instead of 0.37."""
-SHORTLIST, FREE, PARTNERS, PAIRS_JUDGED = 4, 2, 16, 8
+SHORTLIST, FREE, PARTNERS, PAIRS_JUDGED = 4, 2, 12, 8
 """Laws of one, of two and of three numbers, twice as many where these are as good, and free functions, that are judged
 on parts left out; laws of which pairs are tried, and pairs judged."""
 MEASURE = "share of the squared error"
@@ -45,7 +46,7 @@ GROWN = 64.0
 """Pace over which sizes of delays and lags are grown: an eighth of a slowest time constant."""
 Cells = Float[np.ndarray, "*part age obs"]
 """Squared errors by age, the time since the start of a window: before the start is settled, and two later ones."""
-FIRST_STEPS, SCREEN_STEPS, JUDGED_STEPS = 8, 30, 30
+FIRST_STEPS, SCREEN_STEPS, JUDGED_STEPS = 4, 30, 30
 """Steps of the first fit of all, of the best of these on, and of one that is judged."""
 
 
@@ -103,8 +104,9 @@ class Search(NamedTuple):
     data: Dataset
     log: Log
     every: Sequence[Candidate]
-    free: Sequence[Candidate]
-    """Laws of the catalogue, and functions without a name."""
+    """Laws of the catalogue."""
+    free: Callable[[int, Sequence[Key]], list[Candidate]]
+    """Functions without a name of so many signals, those that extend some laws by one."""
     begin: Any = None
     """States at all starts, by the model without further laws."""
     scale: Any = None
@@ -242,12 +244,17 @@ def around_of(fitted: Identified, data: Dataset) -> SearchScales:
     )  # fmt: skip
 
 
-def free_functions(before: Identified, around: SearchScales, data: Dataset) -> list[Candidate]:
-    """Functions of one or two signals at every port, free of what the parameters can do."""
+def free_functions(
+    before: Identified, around: SearchScales, data: Dataset, count: int, extend: Sequence[Key] = ()
+) -> list[Candidate]:
+    """Functions of some signals at every port, free of what the parameters can do; of two, those that extend some of
+    one, as a function of two is seldom the same on average over either.
+    """
     model, prior = before.model, before.m_step.prior
     system, seen, out = cast(Any, model.system), motion(model, data), []
-    names = [names for count in (1, 2) for names in itertools.combinations(around.sizes, count)]
-    for port, reads in itertools.product(system.open_ports, names):
+    for port, reads in itertools.product(system.open_ports, itertools.combinations(around.sizes, count)):
+        if count > 1 and not any(key[2] == port and {*key[3]} < {*reads} for key in extend):
+            continue
         low, high = np.asarray([around.sizes[name] for name in reads]).T
         start = free_term(system, seen, prior.declared, port, reads, low, high)
         spread = jnp.full(start.weights.shape, STRONG * around.torque[system.ports.index(port)])
@@ -261,7 +268,7 @@ def by_simulation(before: Identified, data: Dataset, log: Log) -> Method:
     around = around_of(before, data)
     kinds = [kind for kind in catalogue.values() if issubclass(kind, SignalEffect | SensorEffect | DriveEffect)]
     every = [candidate for kind in kinds for candidate in kind.candidates(around)]
-    search = Search(before, data, log, every, free_functions(before, around, data))
+    search = Search(before, data, log, every, partial(free_functions, before, around, data))
     rows = int(np.asarray(data.valid).sum(axis=1).max())
     return Method(
         [rows],
@@ -329,7 +336,7 @@ def _round(search: Search, hypothesis: Hypothesis, rows: int) -> Round:
     if room < MULTI_STEP:
         return nothing
     singles = search.screened(bare, [((law,), law.probes[:1]) for law in some], 3 * PARTNERS)
-    short = []
+    partners, short = [case for case in singles if case.sound][:PARTNERS], []
     for numbers in range(1, 4):
         sound = [case for case in singles if case.numbers == numbers and case.sound]
         gains = [1 - search.loss(case.of) / whole for case in sound]
@@ -339,15 +346,19 @@ def _round(search: Search, hypothesis: Hypothesis, rows: int) -> Round:
     judged = search.judged(bare, short, parts[0])
     passing, tried = [case for case in judged if _passes(case)], [*judged]
     if room > max([MULTI_STEP, *(case.share for case in passing)]) / NAMED:  # else no pair, no function could be chosen
-        both = itertools.combinations(singles[:PARTNERS], 2)
+        both = itertools.combinations(partners, 2)
         joined = [((*a.laws, *b.laws), (*a.effects, *b.effects)) for a, b in both]
-        pairs = search.screened(bare, joined, 3 * PAIRS_JUDGED)
-        functions = search.screened(bare, [((law,), law.probes[:1]) for law in search.free if fresh(law)], 2 * FREE)
+        pairs = search.screened(bare, joined, 2 * PAIRS_JUDGED)
+        functions: list[Case] = []
+        for signals in (1, 2):
+            free = search.free(signals, [case.keys[0] for case in functions[:SHORTLIST]])
+            starts = [((law,), law.probes[:1]) for law in free if fresh(law)]
+            functions = _ranked([*functions, *search.screened(bare, starts, 2 * FREE)])
         best = [*[case for case in pairs if case.sound][:PAIRS_JUDGED], *functions[:FREE]]
         tried += search.judged(bare, best, parts[0])
         passing = [case for case in tried if _passes(case)]
     if passing:
-        rivals = _rivals(search, bare, _chosen(passing)[0], singles, whole)
+        rivals = _rivals(search, bare, _chosen(passing)[0], [*partners, *_first(singles)], whole)
         unseen = [case for case in rivals if all(set(case.keys) != set(other.keys) for other in tried)]
         tried += search.judged(bare, unseen[:PAIRS_JUDGED], parts[0])
         passing = [case for case in tried if _passes(case)]
@@ -366,7 +377,7 @@ def _round(search: Search, hypothesis: Hypothesis, rows: int) -> Round:
     places = lambda case: case.places(bare.model.system)  # noqa: E731
     apart = lambda case: len(case.laws) == 1 and places(case).isdisjoint(places(best))  # noqa: E731
     if any(case.numbers <= best.numbers and apart(case) for case in alike):
-        best, *alike = _ahead(search, bare, alike, singles, parts[0])
+        best, *alike = _ahead(search, bare, alike, partners, parts[0])
     if rivals := [case for case in alike if case.numbers <= best.numbers and apart(case)]:
         keys = tuple(key for case in (best, *rivals) for key in case.keys)
         search.log(f"  cannot tell: {', '.join(map(words, keys))} explain the same; none is added")
@@ -392,14 +403,14 @@ def _first(singles: Sequence[Case]) -> list[Case]:
     return [case for case in singles if isinstance(case.laws[0].start, MotorGain | InputBias)]
 
 
-def _ahead(search: Search, bare: Hypothesis, laws: Sequence[Case], singles: Sequence[Case], null: Cells) -> list[Case]:
+def _ahead(search: Search, bare: Hypothesis, laws: Sequence[Case], partners: Sequence[Case], null: Cells) -> list[Case]:
     """Cases that explain the same, the best first, without those that leave more once a further law is with each; from
     all starts of laws, of which many are near a better one by themselves.
     """
     least = []
     for case in laws:
         starts = [case.effects, *(law.probes[:1] for law in search.every if (key_of(law.start),) == case.keys)]
-        others = [other for other in singles[:PARTNERS] if other.keys[0] not in case.keys]
+        others = [other for other in partners if other.keys[0] not in case.keys]
         pairs = [((*case.laws, *other.laws), (*start, *other.effects)) for other in others for start in starts]
         pairs = [pair for pair in search.screened(bare, pairs, PAIRS_JUDGED) if pair.sound][:SHORTLIST]
         least.append(min(search.judged(bare, pairs, null), key=lambda pair: pair.left, default=case))
@@ -413,13 +424,12 @@ def _as_likely(case: Case, top: Case) -> bool:
     return 0.5 * simulated.independent(top.of) * math.log(case.left / top.left) < EQUIVALENT_NATS
 
 
-def _rivals(search: Search, bare: Hypothesis, best: Case, singles: Sequence[Case], whole: float) -> list[Case]:
-    """Laws of `best` with another one in the place of each that explain as much of the error `whole`, best first."""
-    others = {id(case): case for case in (*singles[:PARTNERS], *_first(singles))}.values()
+def _rivals(search: Search, bare: Hypothesis, best: Case, others: Sequence[Case], whole: float) -> list[Case]:
+    """Laws of `best` with one of others in the place of each that explain as much of the error `whole`, best first."""
     sets = []
     for i in range(len(best.laws)):
         laws, effects = tuple(a[:i] + a[i + 1 :] for a in (best.laws, best.effects))
-        fresh = [case for case in others if case.keys[0] not in best.keys]
+        fresh = [case for case in {id(case): case for case in others}.values() if case.keys[0] not in best.keys]
         sets += [((*laws, *case.laws), (*effects, *case.effects)) for case in fresh]
     fits = search.screened(bare, sets, 3 * PAIRS_JUDGED)
     explained = lambda case: 1 - search.loss(case.of) / whole  # noqa: E731

@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 
 from .actuator import ActuatorLag, DeadZone, InputDelay, InputEffect, MotorGain, Saturation
 from .base import AbstractEffect, Candidate, Scalar, SearchScales, SensorEffect, a, fields, known, one
-from .sensor import SensorBias, SensorDelay, SensorScale
+from .sensor import SensorBias, SensorScale
 
 STRONG = 5.0
 """Prior standard deviation of a strength: multiple of that which moves a state by its typical rate over the range of
@@ -61,9 +61,9 @@ class PlantLaw(AbstractEffect):
     @classmethod
     def nothing(cls, system: Any) -> "PlantLaw":
         """None of the laws."""
-        inputs, sensors = jnp.zeros((4, len(system.inputs))), jnp.zeros((3, len(system.readable)))
-        signals, ports = jnp.zeros(len(system.states) + len(system.inputs)), jnp.zeros(len(system.ports))
-        none, kind = a(1e-12), jnp.zeros(len(FORMS))
+        inputs, sensors = _zeros(4, len(system.inputs)), _zeros(3, len(system.readable))
+        signals, ports = _zeros(len(system.states) + len(system.inputs)), _zeros(len(system.ports))
+        none, kind = a(1e-12), _zeros(len(FORMS))
         return cls(none, none, none, inputs, sensors, kind, signals, signals, ports, ports, a(0.0))
 
     def force(self, scene, memory):
@@ -95,27 +95,23 @@ class PlantLaw(AbstractEffect):
 
 
 class OtherLaw(AbstractEffect):
-    """A delay of an input, a lag of an input, a delay of readings, or parameters k of the plant, times
-    1 + number (p - middle), by zeros and ones; p is the signal that `pick` picks.
+    """A delay of an input, a lag of an input, or parameters k of the plant, times 1 + number (p - middle), by zeros and
+    ones; p is the signal that `pick` picks.
     """
 
     meaning: ClassVar[str] = "A law of equations that takes time, or a parameter that is none."
     confirm: ClassVar[str] = "Make a step."
     number: Scalar
     inputs: Float[Array, "2 *input"] = known()
-    sensors: Float[Array, "1 *readable"] = known()
     which: Float[Array, " parameter"] = known()
     pick: Float[Array, " signal"] = known()
     middle: Any = known()
-    late: Any = known()
-    """1 where some reading is late."""
 
     @classmethod
     def nothing(cls, system: Any) -> "OtherLaw":
         """None of the laws."""
-        inputs, sensors = jnp.zeros((2, len(system.inputs))), jnp.zeros((1, len(system.readable)))
-        signals = jnp.zeros(len(system.states) + len(system.inputs))
-        return cls(a(1e-12), inputs, sensors, jnp.zeros(len(system.of.parameters)), signals, a(0.0), a(0.0))
+        inputs, which = _zeros(2, len(system.inputs)), _zeros(len(system.of.parameters))
+        return cls(a(1e-12), inputs, which, _zeros(len(system.states) + len(system.inputs)), a(0.0))
 
     def at_drive(self, place, index):
         return dataclasses.replace(self, inputs=self.inputs[:, index])
@@ -124,12 +120,6 @@ class OtherLaw(AbstractEffect):
         delay, lag = self.inputs
         late = InputDelay(self.number * delay, channel="").input(u, dt)
         return jnp.where(lag > 0, ActuatorLag(self.number * lag, channel="").input(u, dt), late)
-
-    def at_reading(self, name, index):
-        return dataclasses.replace(self, sensors=self.sensors[:, index])
-
-    def reading(self, value, past):
-        return jnp.where(self.sensors[0] > 0, past(self.number * self.late), value)  # the same for all: done once
 
     def force(self, scene, memory):
         system, still = scene.system, jnp.zeros_like(scene.drive)
@@ -148,12 +138,12 @@ def lean(effect: AbstractEffect, system: Any) -> AbstractEffect:
         return effect
     kind, at, place = PLACES[type(effect)]
     form = kind.nothing(system)
-    here = _one_of({"inputs": system.inputs, "sensors": system.readable}[at], effect.channel)
-    here = jnp.ones_like(here) if effect.channel == "all" else here
-    more = {"late": a(float(at == "sensors"))} if kind is OtherLaw else {"edge": getattr(effect, "range", a(0.0))}
-    form = dataclasses.replace(form, **{at: getattr(form, at).at[place].set(here)}, **more)
-    own = [getattr(effect, name) for name in fields(effect)]
-    return eqx.tree_at(lambda e: [getattr(e, name) for name in fields(form)[: len(own)]], form, own)
+    here = np.array(getattr(form, at))
+    names = {"inputs": system.inputs, "sensors": system.readable}[at]
+    here[place] = _one_of(names, effect.channel)
+    more: dict[str, Any] = {at: jnp.asarray(here)} | ({"edge": effect.range} if isinstance(effect, Bend) else {})
+    more |= {to: getattr(effect, of) for to, of in zip(fields(form), fields(effect), strict=False)}
+    return dataclasses.replace(form, **more)
 
 
 def numbered(effect: AbstractEffect, form: AbstractEffect) -> AbstractEffect:
@@ -166,7 +156,12 @@ def numbered(effect: AbstractEffect, form: AbstractEffect) -> AbstractEffect:
 
 def _one_of(names: Sequence[str], name: str | None) -> Float[Array, " name"]:
     """1 at the place of a name, else 0."""
-    return a([float(other == name) for other in names])
+    return jnp.asarray(np.array([float(other == name) for other in names]))
+
+
+def _zeros(*shape: int) -> Array:
+    """Zeros by way of NumPy: a search makes thousands, and those of JAX are programs."""
+    return jnp.asarray(np.zeros(shape))
 
 
 class SignalEffect(AbstractEffect):
@@ -212,7 +207,7 @@ class PortEffect(SignalEffect):
         signals, ports, way = (*system.states, *system.inputs), system.ports, -1.0 if self.leaves else 1.0
         first, second = (_one_of(signals, (*self.reads, None, None)[i]) for i in (0, 1))
         source, target = way * _one_of(ports, self.channel), -way * _one_of(ports, self.to)
-        kind, numbers = jnp.eye(len(FORMS))[self.kind], {name: getattr(self, name) for name in fields(self)}
+        kind, numbers = jnp.asarray(np.eye(len(FORMS))[self.kind]), {name: getattr(self, name) for name in fields(self)}
         places = {"first": first, "second": second, "source": source, "target": target}
         return dataclasses.replace(PlantLaw.nothing(system), kind=kind, edge=self.edge, **numbers, **places)
 
@@ -601,6 +596,6 @@ PLACES: dict[type[AbstractEffect], tuple[type[PlantLaw | OtherLaw], str, int]] =
     MotorGain: (PlantLaw, "inputs", 0), InputBias: (PlantLaw, "inputs", 1), DeadZone: (PlantLaw, "inputs", 2),
     Saturation: (PlantLaw, "inputs", 3), SensorScale: (PlantLaw, "sensors", 0), SensorBias: (PlantLaw, "sensors", 1),
     Bend: (PlantLaw, "sensors", 2), InputDelay: (OtherLaw, "inputs", 0), ActuatorLag: (OtherLaw, "inputs", 1),
-    SensorDelay: (OtherLaw, "sensors", 0),
 }  # fmt: skip
-"""Laws of inputs and readings: the form that each has in common with others, and its place there."""
+"""Laws of inputs and readings: the form that each has in common with others, and its place there; a late reading has
+none, as a state of some time ago costs more than all other laws."""

@@ -104,32 +104,50 @@ def simulated(model: StateSpaceModel, prior: ParameterPrior, data: Dataset, begi
     that its own filter has.
     """
     begin = filtered(model, data) if begin is None else begin
-    return together([model], [prior], [np.zeros_like(begin.mean)], data, begin)[0]
+    still = np.zeros_like(begin.mean)
+    return SideBySide([model], [prior], data, begin).at([0], [np.asarray(prior.read(model))], [still])[0]
 
 
-def together(
-    models: Sequence[StateSpaceModel], priors: Sequence[ParameterPrior], starts: Sequence, data: Dataset, begin: Starts
-) -> list[Simulated]:
-    """`simulated` of models of one structure, from `starts` about `begin`."""
-    at, count = windows(models[0], data), len(data.t)
-    numbers = [eqx.filter((m, p, p.read(m)), eqx.is_array) for m, p in zip(models, priors, strict=True)]
-    static = eqx.filter((models[0], priors[0], jnp.zeros(0)), eqx.is_array, inverse=True)
-    out, most, group = [], 64, 16  # models, and simulations at once: of more a step takes as long
-    for first in range(0, len(models), most):
-        some, begun = numbers[first : first + most], np.concatenate(starts[first : first + most])
-        stacked = jax.tree.map(lambda *a: np.repeat(np.stack(list(map(np.asarray, a))), count, axis=0), *some)
-        copies = np.tile(np.arange(count), len(some))
-        logs, mean = jax.tree.map(lambda a, copies=copies: np.asarray(a)[copies], (data, begin.mean))
-        out_of = begun, *each(_errors, (static, at, begin.width), (stacked, logs, mean, begun), group=group)
-        for i, (_, _, z) in enumerate(some):
-            values = (np.asarray(a[i * count : (i + 1) * count]) for a in out_of)
-            out.append(Simulated(models[first + i], priors[first + i], np.asarray(z), *values))
-    return out
+class SideBySide:
+    """Models of one structure, from states about `begin`: what a step of a fit changes is their parameters alone."""
+
+    def __init__(
+        self, models: Sequence[StateSpaceModel], priors: Sequence[ParameterPrior], data: Dataset, begin: Starts
+    ):
+        """Stacks the numbers of the models, which takes longer than to simulate some."""
+        every = [*zip(models, priors, strict=True)]
+        numbers = (jax.tree.map(np.asarray, eqx.filter(one, eqx.is_array)) for one in every)
+        self.every, self.data, self.begin, self.windows = every, data, begin, windows(models[0], data)
+        self.static, self.numbers = eqx.filter(every[0], eqx.is_array, inverse=True), _stacked(*numbers)
+
+    def at(self, places: Sequence[int], z: Sequence[np.ndarray], starts: Sequence[np.ndarray]) -> list[Simulated]:
+        """`simulated` of the models at some places, with the parameters `z` and the starts of each."""
+        out, count, most = [], len(self.data.t), 64  # models at once, so that their derivatives are not held twice
+        common = self.static, self.windows, self.begin.width
+        for first in range(0, len(places), most):
+            some, by, begun = places[first : first + most], z[first : first + most], starts[first : first + most]
+            size = len(some) * count
+            group = 16 if size > 4 else 4  # two programs for all numbers; of more than 16 a step takes as long as of 16
+            entry = np.minimum(np.arange(-(-size // group) * group), size - 1)  # the last again
+            copy, log = np.divmod(entry, count)
+            at = np.asarray(some)[copy]
+            numbers = jax.tree.map(lambda a, at=at: a[at], self.numbers)
+            logs, mean = jax.tree.map(lambda a, log=log: np.asarray(a)[log], (self.data, self.begin.mean))
+            batch = numbers, np.stack(by)[copy], logs, mean, np.concatenate(begun)[entry]
+            every = [np.asarray(a) for a in each(_errors, common, batch, group=group)]
+            for i, place in enumerate(some):
+                of = (a[i * count : (i + 1) * count] for a in every)
+                out.append(Simulated(*self.every[place], by[i], begun[i], *of))
+        return out
+
+
+def _stacked(*trees):
+    return jax.tree.map(lambda *a: np.stack(a), *trees)
 
 
 def _errors(common, one):
-    (static, at, width), (numbers, seq, begin, start) = common, one
-    model, prior, z = eqx.combine(numbers, static)
+    (static, at, width), (numbers, z, seq, begin, start) = common, one
+    model, prior = eqx.combine(numbers, static)
     first = at.row[:, 0]
 
     def predicted(both):
@@ -256,19 +274,23 @@ def fit_all(
     `counts` are the errors that count.  Raises TimeUp where a deadline (`storage/deadline.py`) is over first.
     """
     in_time()
-    best = together(models, priors, [np.zeros_like(begin.mean)] * len(models), data, begin)
+    simulations, every = SideBySide(models, priors, data, begin), [*range(len(models))]
+    z = [np.asarray(prior.read(model)) for model, prior in zip(models, priors, strict=True)]
+    best = simulations.at(every, z, [np.zeros_like(begin.mean)] * len(models))
     known = best[0].observed & (True if counts is None else counts)
     values = [log_posterior(one, scale, known) for one in best]
-    damping, open_ = [1e-2] * len(best), list(range(len(best)))
+    damping, open_ = [1e-2] * len(best), every
     falls = 0.1  # gain in the log of the posterior [nat] below which a fit ends: laws are told apart by five
     for _ in range(steps):
         in_time()
-        ahead, moved = [], []
-        for i in open_:
-            step, start = _step(best[i], scale, known, damping[i])
-            ahead.append(best[i].prior.write(best[i].model, jnp.asarray(best[i].z + step)))
-            moved.append(best[i].start + start.reshape(best[i].start.shape))
-        trials = together(ahead, [priors[i] for i in open_], moved, data, begin) if open_ else []
+        if not open_:
+            break
+        steps_of = [_step(best[i], scale, known, damping[i]) for i in open_]
+        moved = [
+            (best[i].z + step, best[i].start + start.reshape(best[i].start.shape))
+            for i, (step, start) in zip(open_, steps_of, strict=True)
+        ]
+        trials = simulations.at(open_, *zip(*moved, strict=True))
         for i, trial in zip(list(open_), trials, strict=True):
             after = log_posterior(trial, scale, known)
             if after > values[i]:
@@ -278,7 +300,7 @@ def fit_all(
                 gain, damping[i] = math.inf, 4 * damping[i]
             if (gain < falls and damping[i] < 1.0) or damping[i] > 1e6:  # a damped step is short, whatever it gains
                 open_.remove(i)
-    return best
+    return [one._replace(model=one.prior.write(one.model, jnp.asarray(one.z))) for one in best]
 
 
 def precision(of: Simulated) -> Float[np.ndarray, "param param"]:

@@ -30,11 +30,12 @@ type = "equations"
 inputs = { Q1 = "%", Q2 = "%" }
 states = { H1 = "degC", H2 = "degC", T1 = "degC", T2 = "degC" }
 rates = { H1 = "a1*Q1 - k*(H1 - Ta)", H2 = "a2*Q2 - k*(H2 - Ta)", T1 = "(H1 - T1)/tau", T2 = "(H2 - T2)/tau" }
+exact = ["T1", "T2"]
 a1 = { mean = 0.006, std = 0.003 }
 a2 = { mean = 0.004, std = 0.002 }
 k = { mean = 0.006, std = 0.003 }
 tau = { mean = 20, std = 10 }
-Ta = { mean = 21, std = 2 }
+Ta = 20.9
 
 [sampling]
 dt = 3

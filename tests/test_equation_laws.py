@@ -176,13 +176,12 @@ def test_noise_of_readings_is_no_room_for_laws():
 
 
 def test_laws_that_make_a_reading_worse_at_some_age_are_refused():
-    """Two readings at three ages on four parts; one error of twelve rises, by a fifth of its square."""
+    """Two readings at three ages on four parts; one error of twelve rises, to more than twice its square."""
     before = np.ones((4, 3, 2))
     after = 0.5 * before
     assert not equations.worsens(before, after)
-    for rise, parts, worse in ((1.2, 4, True), (1.2, 3, True), (1.05, 4, False), (1.2, 2, False)):
-        after[:, 1, 1] = np.where(np.arange(4) < parts, rise, 1.1 if parts < 3 else 1.05)
-        after[parts:, 1, 1] = 0.999
+    for rise, parts, worse in ((2.1, 4, True), (2.5, 3, True), (1.9, 4, False), (9.0, 2, False)):
+        after[:, 1, 1] = np.where(np.arange(4) < parts, rise, 0.999)
         assert equations.worsens(before, after) == worse
 
 

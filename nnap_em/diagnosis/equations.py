@@ -33,7 +33,7 @@ from .keys import Key, complexity, key_of, words
 from .outcome import Step, Suspect
 from .search import Method, Round
 from .trial import certainty
-from .verdict import AGREE, DETERMINED, EQUIVALENT, EQUIVALENT_NATS, MULTI_STEP, NAMED, agreed, even, suspected
+from .verdict import AGREE, DETERMINED, EQUIVALENT, EQUIVALENT_NATS, MULTI_STEP, NAMED, WORSE, agreed, even, suspected
 
 FOLDS, BLOCKS = 4, 16
 """Parts that are left out in turn, each of every fourth block of the rows: of twice as long ones the real tanks have
@@ -208,11 +208,9 @@ class Search(NamedTuple):
 
 
 def worsens(before: Cells, after: Cells) -> bool:
-    """True where the errors of some reading rise with laws, at some age, on most parts and in all by more than laws
-    that explain the same differ.
-    """
+    """True where the errors of some reading rise with laws, at some age, on most parts and in all to a multiple."""
     risen = (after > before).mean(axis=0) >= AGREE
-    return bool(np.any(risen & (before.sum(axis=0) < EQUIVALENT * after.sum(axis=0))))
+    return bool(np.any(risen & (after.sum(axis=0) > WORSE * before.sum(axis=0))))
 
 
 def folds(at: simulated.Windows, sequences: int) -> list[Bool[np.ndarray, "seq window place 1"]]:

@@ -46,8 +46,9 @@ GROWN = 64.0
 """Pace over which sizes of delays and lags are grown: an eighth of a slowest time constant."""
 Cells = Float[np.ndarray, "*part age obs"]
 """Squared errors by age, the time since the start of a window: before the start is settled, and two later ones."""
-FIRST_STEPS, SCREEN_STEPS, JUDGED_STEPS = 4, 30, 30
-"""Steps of the first fit of all, of the best of these on, and of one that is judged."""
+FIRST_STEPS, JOINED_STEPS, SCREEN_STEPS, JUDGED_STEPS = 8, 4, 30, 30
+"""Steps of the first fit of all (a leak takes more than four), of pairs, which begin with what was fitted, of the best,
+and of one that is judged."""
 
 
 class Case(NamedTuple):
@@ -157,11 +158,15 @@ class Search(NamedTuple):
         return simulated.cost(of.error, self.scale, of.observed)
 
     def screened(
-        self, hypothesis: Hypothesis, every: Sequence[tuple[Sequence[Candidate], Sequence[Any]]], most: int
+        self,
+        hypothesis: Hypothesis,
+        every: Sequence[tuple[Sequence[Candidate], Sequence[Any]]],
+        most: int,
+        steps: int = JOINED_STEPS,
     ) -> list[Case]:
         """The hypothesis with each set of laws, fitted, `most` of them to the end; the best of each, best first."""
         best: dict[tuple[Key, ...], Case] = {}
-        for case in _ranked(self.fit(hypothesis, every, steps=FIRST_STEPS).values()):
+        for case in _ranked(self.fit(hypothesis, every, steps=steps).values()):
             best.setdefault(case.keys, case)
         few = [*best.values()][:most]
         models = [case.of.model for case in few]
@@ -333,7 +338,7 @@ def _round(search: Search, hypothesis: Hypothesis, rows: int) -> Round:
     search.log(f"{len(some)} candidates; {max(room, 0.0):.0%} of the squared error is not noise of the readings")
     if room < MULTI_STEP:
         return nothing
-    singles = search.screened(bare, [((law,), law.probes[:1]) for law in some], 3 * PARTNERS)
+    singles = search.screened(bare, [((law,), law.probes[:1]) for law in some], 4 * PARTNERS, FIRST_STEPS)
     partners, short = [case for case in singles if case.sound][:PARTNERS], []
     for numbers in range(1, 4):
         sound = [case for case in singles if case.numbers == numbers and case.sound]
@@ -351,7 +356,7 @@ def _round(search: Search, hypothesis: Hypothesis, rows: int) -> Round:
         for signals in (1, 2):
             free = search.free(signals, [case.keys[0] for case in functions[:SHORTLIST]])
             starts = [((law,), law.probes[:1]) for law in free if fresh(law)]
-            functions = _ranked([*functions, *search.screened(bare, starts, 2 * FREE)])
+            functions = _ranked([*functions, *search.screened(bare, starts, 2 * FREE, FIRST_STEPS)])
         best = [*[case for case in pairs if case.sound][:PAIRS_JUDGED], *functions[:FREE]]
         tried += search.judged(bare, best, parts[0])
         passing = [case for case in tried if _passes(case)]

@@ -248,7 +248,7 @@ def around_of(fitted: Identified, data: Dataset) -> SearchScales:
 
 
 def free_functions(
-    before: Identified, around: SearchScales, data: Dataset, count: int, extend: Sequence[Key] = ()
+    before: Identified, around: SearchScales, data: Dataset, count: int, extend: Sequence[Key]
 ) -> list[Candidate]:
     """Functions of some signals at every port, free of what the parameters can do; of two, those that extend some of
     one, as a function of two is seldom the same on average over either.

@@ -118,7 +118,8 @@ class SideBySide:
         every = [*zip(models, priors, strict=True)]
         numbers = (jax.tree.map(np.asarray, eqx.filter(one, eqx.is_array)) for one in every)
         self.every, self.data, self.begin, self.windows = every, data, begin, windows(models[0], data)
-        self.static, self.numbers = eqx.filter(every[0], eqx.is_array, inverse=True), _stacked(*numbers)
+        self.static = eqx.filter(every[0], eqx.is_array, inverse=True)
+        self.numbers = jax.tree.map(lambda *a: np.stack(a), *numbers)
 
     def at(self, places: Sequence[int], z: Sequence[np.ndarray], starts: Sequence[np.ndarray]) -> list[Simulated]:
         """`simulated` of the models at some places, with the parameters `z` and the starts of each."""
@@ -126,23 +127,15 @@ class SideBySide:
         common = self.static, self.windows, self.begin.width
         for first in range(0, len(places), most):
             some, by, begun = places[first : first + most], z[first : first + most], starts[first : first + most]
-            size = len(some) * count
-            group = 16 if size > 4 else 4  # two programs for all numbers; of more than 16 a step takes as long as of 16
-            entry = np.minimum(np.arange(-(-size // group) * group), size - 1)  # the last again
-            copy, log = np.divmod(entry, count)
-            at = np.asarray(some)[copy]
-            numbers = jax.tree.map(lambda a, at=at: a[at], self.numbers)
+            copies, log = np.repeat(some, count), np.tile(np.arange(count), len(some))
+            numbers = jax.tree.map(lambda a, copies=copies: a[copies], self.numbers)
             logs, mean = jax.tree.map(lambda a, log=log: np.asarray(a)[log], (self.data, self.begin.mean))
-            batch = numbers, np.stack(by)[copy], logs, mean, np.concatenate(begun)[entry]
-            every = [np.asarray(a) for a in each(_errors, common, batch, group=group)]
+            batch = numbers, np.repeat(np.stack(by), count, axis=0), logs, mean, np.concatenate(begun)
+            every = [np.asarray(a) for a in each(_errors, common, batch, group=16)]  # of more a step takes as long
             for i, place in enumerate(some):
                 of = (a[i * count : (i + 1) * count] for a in every)
                 out.append(Simulated(*self.every[place], by[i], begun[i], *of))
         return out
-
-
-def _stacked(*trees):
-    return jax.tree.map(lambda *a: np.stack(a), *trees)
 
 
 def _errors(common, one):
@@ -274,12 +267,12 @@ def fit_all(
     `counts` are the errors that count.  Raises TimeUp where a deadline (`storage/deadline.py`) is over first.
     """
     in_time()
-    simulations, every = SideBySide(models, priors, data, begin), [*range(len(models))]
+    simulations, open_ = SideBySide(models, priors, data, begin), [*range(len(models))]
     z = [np.asarray(prior.read(model)) for model, prior in zip(models, priors, strict=True)]
-    best = simulations.at(every, z, [np.zeros_like(begin.mean)] * len(models))
+    best = simulations.at(open_, z, [np.zeros_like(begin.mean)] * len(models))
     known = best[0].observed & (True if counts is None else counts)
     values = [log_posterior(one, scale, known) for one in best]
-    damping, open_ = [1e-2] * len(best), every
+    damping = [1e-2] * len(best)
     falls = 0.1  # gain in the log of the posterior [nat] below which a fit ends: laws are told apart by five
     for _ in range(steps):
         in_time()

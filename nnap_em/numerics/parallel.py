@@ -93,7 +93,7 @@ def each(function: Callable, common: Any, batch: Any, *, together: int | None = 
     if not on_processor:
         group = min(together or share, share)
     else:
-        group = min(together or group, group, 1 << (share - 1).bit_length())
+        group = min(together or group, 1 << (share - 1).bit_length() if share <= GROUP else group)  # few programs
     at_once = group * (1 if mesh is None else mesh.size)
     program, parts = _program(function), []
     common = on_default_device(common) if mesh is None else _place(common, NamedSharding(mesh, P()))

@@ -102,6 +102,9 @@ def test_a_parameter_that_varies_pushes_as_the_equations_with_another_one():
     np.testing.assert_allclose(_pushes(law), [0.0, 0.6 * 2.0], rtol=1e-12)
 
 
+UNITS_OF_A_SLOW_FLOW = {"strength": "1/min", "level": "m", "share": "-", "power": "-"}
+
+
 def test_units_of_a_law_are_those_of_its_port_and_signals():
     system = Equations({}, json.dumps(PLANT))
     for name, reads, unit in (
@@ -111,6 +114,9 @@ def test_units_of_a_law_are_those_of_its_port_and_signals():
     ):
         law = catalogue[name](strength=0.1, channel="a", reads=reads)
         assert law.units_on(system)["strength"] == unit
+    slow = Equations({}, json.dumps(PLANT | {"units": {"time": "min"}}))
+    assert catalogue["linear_flow"](strength=0.1, channel="a", reads=("b",)).units_on(slow) == UNITS_OF_A_SLOW_FLOW
+    assert catalogue["input_delay"].of(0.7, channel="u").units_on(slow) == {"delay": "min"}
 
 
 def test_a_bent_sensor_reads_a_curve():

@@ -72,7 +72,8 @@ def _watch(rig: Rig, most: int, epochs: list[dict[str, Any]], log: Log) -> Watch
         )
         sampled = f"  effective samples {state.ess:.0f}" if math.isfinite(state.ess) else ""
         log(
-            f"epoch {state.epoch:3d} of {most}  horizon {horizon:.2f} s  log-likelihood {loglik:.2f} nat per sequence"
+            f"epoch {state.epoch:3d} of {most}  horizon {horizon:.2f} {rig.time_unit}"
+            f"  log-likelihood {loglik:.2f} nat per sequence"
             f"  noise std {_noise(rig, np.asarray(state.best.log_r))}{sampled}"
             f"  left out {len(out)} of {len(used)}  {seconds:.1f} s"
         )

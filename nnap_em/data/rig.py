@@ -106,8 +106,7 @@ class Rig:
     @property
     def time_unit(self) -> str:
         """Unit of all times: s; of equations as [model.units] time declares it, or none where nothing has a unit."""
-        units = _units(self.equations) if self.equations else {"dt": "s"}
-        return units.get("time", "s" if any(units.values()) else "time units")
+        return _units(self.equations).get("time", "s") if self.equations else "s"
 
     @property
     def ns(self) -> float:
@@ -277,7 +276,7 @@ def write_rig(rig: Rig, path: Path | str) -> None:
         True
     """
     numbers = (*rig.parameters, *rig.start, *rig.noise_std)
-    units = {"dt": "s", "horizon": "s"} | {name: rig.unit(name) for name in numbers}
+    units = {"dt": rig.time_unit, "horizon": rig.time_unit} | {name: rig.unit(name) for name in numbers}
     lines = ["format = 1", f"name = {toml_text(rig.name)}", *written(_tables(rig), (), units)]
     replace_text(Path(path), "\n".join(lines) + "\n")
 

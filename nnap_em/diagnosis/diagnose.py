@@ -82,7 +82,8 @@ def diagnose(
 
     def watch(state: EMState, rows: int, used: Bool[np.ndarray, " seq"]) -> None:
         stages[rows] = state, used
-        log(f"epoch {state.epoch}, horizon {rows * rig.dt:.2f} s: {state.loglik[-1]:.1f} nat per sequence")
+        reach = f"{rows * rig.dt:.2f} {rig.time_unit}"
+        log(f"epoch {state.epoch}, horizon {reach}: {state.loglik[-1]:.1f} nat per sequence")
 
     def ended(fitted: Identified) -> Identified:
         """The end of a fit, whose numbers and posterior were held more tightly in the search than they are stated."""

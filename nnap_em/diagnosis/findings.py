@@ -135,7 +135,8 @@ def verdict(
     if not error or not grows:
         return text + "."
     judged, pairs = _judged(error)
-    horizon = f"{min(judged, error.get('reach_s', judged)):.3g} s"
+    unit = error.get("time_unit", "s")
+    horizon = f"{min(judged, error.get('reach_s', judged)):.3g} {unit}"
     ratios = [(column, *pairs[column]) for column in sorted(grows, key=grows.__getitem__)]
     if sum(grows.values()) >= 0:
         column, before, after = ratios[-1]
@@ -183,7 +184,8 @@ def _risen_before(error: Mapping[str, Any], judged: float) -> list[str]:
     shorter = {horizon: _judged({**error, "judged_s": horizon})[1] for horizon in error["horizons_s"]}
     every = [(a / max(b, 1e-300), h, c, b, a) for h, of in shorter.items() if h < judged for c, (b, a) in of.items()]
     rise, horizon, column, before, after = max(every, default=(0.0, 0.0, "", 0.0, 0.0))
-    text = f"that of {column} at {horizon:.3g} s rises from {before:.3g} to {after:.3g}"
+    unit = error.get("time_unit", "s")
+    text = f"that of {column} at {horizon:.3g} {unit} rises from {before:.3g} to {after:.3g}"
     return [text] if rise**2 > 1 / EQUIVALENT else []
 
 

@@ -97,7 +97,7 @@ def names_of(fitted: Identified) -> Names:
     """Names of the columns of `residual(fitted, ...)`."""
     system, rig = fitted.model.system, fitted.rig
     if rig.equations:
-        units = {name: system.unit(name) for name in (*system.readable, *rig.input_columns)}
+        units = {name: system.unit(name) for name in (*system.readable, *rig.input_columns, "time")}
         sensors = {name: units[name] for name in system.readable}
         return Names((), (), (), rig.input_columns, (), rig.measured, sensors, units)
     return Names(

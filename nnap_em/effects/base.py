@@ -218,12 +218,13 @@ class AbstractEffect(eqx.Module):
 
     def units_on(self, system: Any) -> dict[str, str]:
         """Units of the reported parameters on this machine and channel."""
+        own = {name: system.unit("time") if unit == "s" else unit for name, unit in self.units.items()}
         if self.channel in system.readable:
-            return {name: unit.replace(CHANNEL_UNIT, system.unit(self.channel)) for name, unit in self.units.items()}
+            return {name: unit.replace(CHANNEL_UNIT, system.unit(self.channel)) for name, unit in own.items()}
         if self.joint is None:
-            return self.units | self.units_free
+            return own | self.units_free
         force, angle = system.force_unit(self.joint), system.unit(system.coordinates[self.joint - 1])
-        return {name: unit.replace("N m", force).replace("rad", angle) for name, unit in self.units.items()}
+        return {name: unit.replace("N m", force).replace("rad", angle) for name, unit in own.items()}
 
     def is_physical(self) -> bool:
         """True if the fitted values are physical."""

@@ -221,8 +221,8 @@ class PortEffect(SignalEffect):
         per = [[], one, one, signals[:2], one * 2, one, [], [of] if of else [], one * 3][self.kind]
         per = [unit for unit in per if unit]
         strength = f"{port}/({' '.join(per)})" if len(per) > 1 else f"{port}/{per[0]}" if per else port
-        if len(per) == 1 and port == f"{per[0]}/s":
-            strength = "1/s"
+        if len(per) == 1 and port.startswith(f"{per[0]}/"):
+            strength = port.replace(per[0], "1", 1)
         return {"strength": strength, "level": signals[0] if signals else "", "share": "-", "power": "-"}
 
     def phrase(self, sizes):

@@ -72,7 +72,7 @@ class Axis(AbstractAxis):
 
     def unit(self, system):
         name = self.names[0]
-        return "s" if name == "time" else system.unit(name)
+        return system.unit(name)
 
 
 class InputAxis(AbstractAxis):
@@ -256,7 +256,7 @@ class PeriodicForce(JointEffect):
         std = np.sqrt(np.maximum(np.einsum("xi,ij,xj->x", basis, block, basis), 0.0))
         mean = basis @ np.concatenate([self.sine, self.cosine])
         time = x / float(self.frequency)
-        return Curve("time", "s", self.joint, system.force_unit(self.joint), False, time, mean, std)
+        return Curve("time", system.unit("time"), self.joint, system.force_unit(self.joint), False, time, mean, std)
 
     def force(self, scene, memory):
         return self.at(scene, self.waveform(self.frequency * scene.time))

@@ -25,7 +25,7 @@ from .html import Picture, picture, write_report
 from .page import page
 from .residual_plots import innovation_figure, residual_figure
 from .tables import visited_nodes, write_friction
-from .wording import reached
+from .wording import duration, reached
 
 
 def write_diagnosis(
@@ -114,7 +114,7 @@ def _error_pictures(
         errors.append(picture("error", "Prediction error", caption, figure))
         longest, given = int(np.argmax(np.sum(np.asarray(test.data.valid), axis=1))), error["given_s"]
         figure = prediction_figure(alone(predicted), test.data, names, given, longest)
-        caption = f"The longest one ({test.files[longest]}), predicted from its first {given:g} s."
+        caption = f"The longest one ({test.files[longest]}), predicted from its first {duration(error, given)}."
         motion.append(picture("error", "One test sequence", caption, figure))
     if tables:
         caption = "A missing effect bends the friction that is learned without it." if len(tables) > 1 else ""

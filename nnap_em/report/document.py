@@ -28,7 +28,7 @@ def shared(fitted: Identified, train: Logs, test: Logs | None, *, seed: int, beg
         "format": 1,
         "rig": fitted.rig.name,
         "system": fitted.rig.system,
-        "units": {name: system.unit(name) for name in system.readable},
+        "units": {name: system.unit(name) for name in (*system.readable, "time")},
         "error_note": None if test else "no test sequences (FOLDER/test/*.csv), so no prediction error",
         "masked": masked(train, test),
         "undetermined": []
@@ -106,6 +106,7 @@ def errors(predicted: Mapping[str, Prediction], sides: Mapping[str, Identified],
     t, valid = (np.asarray(a) for a in (test.data.t, test.data.valid))
     return {
         "given_s": given,
+        "time_unit": first.rig.time_unit,
         **({"judged_s": horizons[-1]} if first.model.system.simulated else {}),
         "horizons_s": list(horizons),
         "reach_s": float(np.max((t - t[:, :1])[valid])) - given,

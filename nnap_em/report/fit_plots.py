@@ -52,12 +52,13 @@ def error_figure(error: Mapping[str, Any], names: Names) -> Figure:
     """Root mean square error against horizon; `error` as in report.json, a panel for each column."""
     sides = {name: error[name] for name in ("before", "fit", "after") if name in error}
     columns, horizons = list(next(iter(sides.values()))), np.asarray(reached(error), float)
+    ahead = f"time predicted ahead [{names.unit('time')}]"
     figure, (grid,) = panels(len(columns))
     for ax, name in zip(grid, columns, strict=True):
         for side, values, colour in coloured(sides):
             y = np.asarray([math.nan if v is None else v for v in values[name][: len(horizons)]], float)
             dotted(ax, horizons, np.where(y > 0, y, np.nan), colour, side)
-        ax.set(title=symbol(name), xlabel="time predicted ahead [s]", ylabel=f"rms error [{names.unit(name)}]")
+        ax.set(title=symbol(name), xlabel=ahead, ylabel=f"rms error [{names.unit(name)}]")
         ax.set_xscale("log")
         ax.set_xticks(horizons, [f"{horizon:g}" for horizon in horizons])
         ax.xaxis.set_minor_locator(NullLocator())
@@ -96,9 +97,10 @@ def prediction_figure(
         ax.axvspan(float(t[0]), given, color="#F1F1F1", lw=0, zorder=0)
         ax.axvline(given, color="#555555", lw=1.0)
         ax.set_ylabel(f"{symbol(name)} [{names.unit(name)}]" + ("" if name in names.measured else "\nnot measured"))
+    unit = names.unit("time")
     for ax in grid[-1]:
-        ax.set(xlabel="time [s]", xlim=(float(t[0]), float(t[-1])))
-    head(figure, f"One test sequence, predicted from its first {given:g} s (grey)", list(grid.ravel()))
+        ax.set(xlabel=f"time [{unit}]", xlim=(float(t[0]), float(t[-1])))
+    head(figure, f"One test sequence, predicted from its first {given:g} {unit} (grey)", list(grid.ravel()))
     return figure
 
 

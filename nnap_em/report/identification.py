@@ -27,7 +27,7 @@ from .fit_plots import error_figure, friction_figure, term_figure
 from .html import Picture, picture, write_report
 from .page import page
 from .tables import visited_nodes, write_friction
-from .wording import reached
+from .wording import duration, reached
 
 
 def write_identification(
@@ -126,8 +126,8 @@ def _log_summary(document: dict[str, Any], log: Log) -> None:
         lines.append(f"diverged, and left out of the last epoch: {listed(document['left_out'])}")
     error = document["error"] or {"fit": {}}
     for name, values in error["fit"].items():
-        pairs = zip(reached(error), values, strict=False)  # no test sequence reaches the others
-        lines.append(f"error {name}: " + ", ".join(f"{v:.3g} over {h:g} s" for h, v in pairs if not math.isnan(v)))
+        pairs = [(v, h) for h, v in zip(reached(error), values, strict=False) if not math.isnan(v)]
+        lines.append(f"error {name}: " + ", ".join(f"{v:.3g} over {duration(error, h)}" for v, h in pairs))
     for name, entry in document["parameters"].items():
         lines.append(f"{name} = {entry['value']:.6g} +- {entry['std']:.2g} {entry['unit']}")
     for line in filter(None, lines):

@@ -8,7 +8,7 @@ from ..diagnosis.statistics import FAILS
 from ..effects import catalogue
 from ..numerics.digits import finite, number, with_std
 from .html import Part, Picture, Section, Table, rendered, section
-from .wording import label, quantity, ratio, reached, sentence, share
+from .wording import duration, label, quantity, ratio, reached, sentence, share
 
 _NATS = ((100, "Beyond doubt"), (30, "Very sure"), (10, "Sure"), (3, "Likely"))
 _SHARES = ((0.6, "Very sure"), (0.3, "Sure"), (0.15, "Likely"))
@@ -120,7 +120,7 @@ def _errors(document: _Entry) -> list[Part]:
     before, after = error.get("before") or error.get("fit") or {}, error.get("after") or {}
     both, horizons, out = bool(document.get("effects")), reached(error), []
     if before and horizons:
-        given = f"the first {number(error['given_s'], 2)} s" if finite(error.get("given_s")) else "the start"
+        given = f"the first {duration(error, error['given_s'])}" if finite(error.get("given_s")) else "the start"
         what = ": before → after, and how many times smaller it is" * both
         out.append(
             f"Each test sequence is predicted from {given} of its readings, without looking at the rest. The error is "
@@ -129,13 +129,13 @@ def _errors(document: _Entry) -> list[Part]:
         )
         head = ["time ahead", *(f"{column} [{units[column]}]" if units.get(column) else column for column in before)]
         rows = [
-            [f"{number(horizon, 2)} s", *(_change(before[c][i], after[c][i] if both else None) for c in before)]
+            [duration(error, horizon), *(_change(before[c][i], after[c][i] if both else None) for c in before)]
             for i, horizon in enumerate(horizons)
         ]
         out.append(Table(head, rows))
     elif before and finite(error.get("given_s")):
-        given = number(error["given_s"], 2)
-        out.append(f"Predictions start after {given} s, and no test sequence is longer: record some that are.")
+        given = duration(error, error["given_s"])
+        out.append(f"Predictions start after {given}, and no test sequence is longer: record some that are.")
     tests = document.get("tests") or {}
     if tests.get("before"):
         out.append(_failures(tests["before"], tests.get("after")))

@@ -44,6 +44,11 @@ def quantity(entry: Mapping[str, Any]) -> str:
     return with_std(entry.get("value"), entry.get("std")) + ("" if unit in (None, "", "-") else f" {unit}")
 
 
+def duration(error: Mapping[str, Any], value: float) -> str:
+    """A time of the errors of a report with its unit."""
+    return f"{number(value, 2)} {error.get('time_unit', 's')}"
+
+
 def label(effect: Mapping[str, Any]) -> str:
     """An effect, or what else has a name, a joint, a channel and inputs, as a reader would call it."""
     name, joint, channel, inputs = (effect.get(part) for part in ("name", "joint", "channel", "inputs"))

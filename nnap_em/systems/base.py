@@ -49,8 +49,9 @@ class AbstractSystem(AbstractPlant):
         return f"{type(self).__name__}: {quantities(values)}; driven joints: {driven}"
 
     def unit(self, name: str) -> str:
-        if name in self.sensors:
-            return self.sensors[name]
+        known = {"time": "s", **self.sensors}
+        if name in known:
+            return known[name]
         place, dof = self.states.index(name), len(self.coordinates)
         return state_unit(self.angles[place % dof], rate=place >= dof)
 

@@ -37,7 +37,7 @@ class Text(NamedTuple):
         return json.dumps(self._asdict(), ensure_ascii=False)
 
     def unit(self, name: str) -> str:
-        return {**self.states, **self.inputs, **self.units}.get(name, "")
+        return {"time": "s", **self.states, **self.inputs, **self.units}.get(name, "")
 
 
 @functools.cache
@@ -122,7 +122,7 @@ class Equations(AbstractPlant):
     def port_unit(self, port: int) -> str:
         name = self.ports[port - 1]
         unit = self.unit(name)
-        return (f"{unit}/s" if unit else "1/s") if name in self.of.states else unit
+        return f"{unit or 1}/{self.unit('time')}" if name in self.of.states else unit
 
     @property
     def drives(self) -> list[dict[str, Any]]:

@@ -81,7 +81,7 @@ class AbstractPlant(eqx.Module):
 
     @abstractmethod
     def unit(self, name: str) -> str:
-        """Unit of a state or sensor."""
+        """Unit of a state, a sensor or `time`."""
 
     @abstractmethod
     def port_unit(self, port: int) -> str:

@@ -843,11 +843,21 @@ a law from one start
 forms of a law that remove nearly all explain the same
 - [-math.log1p(-value) for value in values], model
 + values, model
-# effects/position.py
-## test_inputs.py::test_a_cogging_that_is_not_seen_to_repeat_is_none
+# effects/base.py
+## test_inputs.py::test_what_is_not_seen_to_repeat_has_no_periods
 a bump is a cogging
 - >= 3 * np.pi
 + >= 2 * np.pi
+# effects/friction.py
+## test_inputs.py::test_what_is_not_seen_to_repeat_has_no_periods
+friction by angle need not repeat
+- return self.repeats(self.n, around)
++ return True
+# effects/function.py
+## test_inputs.py::test_dry_friction_at_an_angle_is_one_free_function_against_the_motion
+a form that is known has a price
+- if axis.count > 1 for name in axis.names
++ for name in axis.names
 # diagnosis/backward.py
 ## test_search.py::test_a_law_of_a_rate_is_judged_by_that_reading_too
 a law of a rate is judged by the coordinates alone

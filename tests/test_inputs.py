@@ -9,10 +9,12 @@ import pytest
 from nnap_em.data.dataset import Dataset
 from nnap_em.data.rig import Declared, Rig
 from nnap_em.diagnosis.hypothesis import Hypothesis
+from nnap_em.diagnosis.keys import complexity
 from nnap_em.diagnosis.propose import proposals, surroundings
 from nnap_em.diagnosis.screen import screen
 from nnap_em.diagnosis.smoothed import SmoothedFit
 from nnap_em.effects import catalogue, free_form
+from nnap_em.effects.base import OperatingPoint
 from nnap_em.effects.function import Axis, UnknownFunction
 from nnap_em.em.build import build
 from nnap_em.model.state_space import Inputs, with_effects
@@ -115,15 +117,56 @@ def test_every_law_of_a_place_a_rate_or_an_input_has_a_free_form(plain):
     }
 
 
-def test_a_cogging_that_is_not_seen_to_repeat_is_none(plain):
-    """The range of 2 rad that was visited holds more than one and a half of five periods a turn, and less of 4.5."""
-    around = plain[-1]._replace(low=-np.ones(2), high=np.ones(2))
-    coggings = {
-        float(c.start.near): c.start.visible(around)
-        for c in catalogue["cogging"].candidates(around)
-        if c.start.joint == 2
+def test_what_is_not_seen_to_repeat_has_no_periods(plain):
+    """The 2 rad where it mostly is hold more than one and a half of five periods a turn, and less of 4.5."""
+    around = plain[-1]._replace(width=2 * np.ones(2), learned=True)
+    for law, periods in (("cogging", "near"), ("position_dependent_friction", "n")):
+        of = [c.start for c in catalogue[law].candidates(around) if c.start.joint == 2]
+        seen = {float(getattr(one, periods)): one.visible(around) for one in of}
+        assert seen[5.0] and seen[max(seen)] and not any(seen[k] for k in seen if k < 4.6)
+
+
+def _spots(around):
+    """Dry friction at some angles."""
+    every = [c for c in catalogue["unknown_function"].candidates(around) if isinstance(c.start, UnknownFunction)]
+    return {c.start.joint: c for c in every if c.start.axes[-1].count == 1}
+
+
+def test_dry_friction_at_an_angle_is_one_free_function_against_the_motion(plain):
+    """Its formula; in its price its form along the rate, which is known, does not count."""
+    spots, system = _spots(plain[-1]), plain[0].system
+    assert {joint: c.start.inputs_named() for joint, c in spots.items()} == {
+        j: (f"theta{j}", f"dtheta{j}") for j in (1, 2)
     }
-    assert coggings[5.0] and not coggings[4.5] and coggings[24.0]
+    both = catalogue["unknown_function"].candidates(plain[-1])
+    prices = {complexity(c.start) for c in both if c.start.inputs_named() == ("theta2", "dtheta2")}
+    assert complexity(spots[2].start) == 1 and prices == {1, 2}
+    angle, knee = spots[2].start.axes
+    weights = 0.1 * np.sin(np.arange(20.0))
+    law = UnknownFunction(jnp.asarray(weights), spots[2].start.axes, joint=2)
+    none = jnp.zeros(2)
+    for at, rate in ((0.3, 2.0), (0.3, -2.0), (-0.1, 0.01)):
+        q, v = jnp.array([1.0, at]), jnp.array([0.5, rate])
+        scene = OperatingPoint(system, q, v, none, jnp.zeros(()), none, lambda _: none)
+        size = weights @ np.asarray(angle.basis(jnp.asarray(at)))
+        np.testing.assert_allclose(law.force(scene, none), [0.0, size * np.tanh(rate / float(knee.high))], rtol=1e-12)
+
+
+def test_a_spot_of_dry_friction_is_found_as_one(plain):
+    """Beside functions of two signals and friction that repeats with the angle, which explain a part of it."""
+    spot = _spots(plain[-1])[2].start
+    centre = np.asarray(spot.axes[0].centres())
+    weights = -0.3 * np.exp(-0.5 * ((centre - np.median(centre)) / 0.1) ** 2)
+    law = UnknownFunction(jnp.asarray(weights), spot.axes, joint=2)
+    drawn, asked = law.curve(np.eye(20), plain[0].system), _asked((law,))
+    assert drawn.x[np.argmax(drawn.mean)] == pytest.approx(np.median(centre), abs=0.06)  # what it takes
+    rivals = [c for c in proposals(asked[-1]) if c.start.joint == 2 and len(c.start.signals(plain[0].system)) == 2]
+    shares = {
+        (complexity(c.start), c.start.name): v.share.least
+        for c, v in zip(rivals, _screened(asked, rivals), strict=True)
+    }
+    best = max(shares, key=shares.__getitem__)
+    assert best == (1, "unknown_function"), shares
 
 
 def test_a_spring_is_straight_beyond_what_was_seen():

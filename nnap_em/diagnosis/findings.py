@@ -220,8 +220,9 @@ def _alone(finding: Finding) -> str:
     if sizes or curve is None:
         return f"{name} ({' = '.join(next(iter(sizes.items())))})" if sizes else name
     if not finding.effect.named:
-        kind, inputs = "force" if curve.unit == "N" else "torque", listed(finding.effect.inputs_named())
-        name = f"a {kind} at joint {finding.effect.joint} that depends on {inputs}"
+        free, kind = finding.effect.inputs_free(), "a force" if curve.unit == "N" else "a torque"
+        kind = kind if free == finding.effect.inputs_named() else "dry friction"
+        name = f"{kind} at joint {finding.effect.joint} that depends on {listed(free)}"
     return f"{name} ({number(float(f'{np.ptp(curve.mean):.2g}'), 2)} {curve.unit} from trough to peak)"
 
 

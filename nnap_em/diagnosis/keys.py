@@ -69,10 +69,12 @@ def completed(effect: AbstractEffect, model: StateSpaceModel) -> bool:
 
 
 def complexity(law: AbstractEffect, model: StateSpaceModel | None = None) -> int:
-    """Number of signals of a law without a name, 0 for one with a name; -1 for a part of what a `model` has already."""
+    """Number of signals in which a law without a name is free, 0 for one with a name; -1 for a part of what a `model`
+    has already.
+    """
     if model is not None and not (remainder_of(law, model) is None and replaced(law, model) is None):
         return -1
-    return 0 if law.named else max(1, len(law.inputs_named()))
+    return 0 if law.named else max(1, len(law.inputs_free()))
 
 
 def elsewhere(one: Key, other: Key) -> bool:

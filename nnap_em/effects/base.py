@@ -70,6 +70,8 @@ class SearchScales(NamedTuple):
     """Ranges of states and inputs, and of the readings, of equations."""
     moved: tuple[tuple[str, str, float], ...] | None = None
     """Estimated numbers of the machine with unit and size, where the question is what changed since a fit."""
+    width: Float[np.ndarray, " dof"] = np.zeros(0)
+    """Range in which every coordinate is for nine tenths of the time [rad]: what lies beyond repeats nothing."""
     dry: Float[np.ndarray, " dof"] = np.zeros(0)
     """Dry friction of the learned map: its odd part at 0.4 of the largest velocity, less the viscous one [N m]."""
 
@@ -238,6 +240,10 @@ class AbstractEffect(eqx.Module):
         """Arguments of the function, for laws without a name in the vocabulary."""
         return ()
 
+    def inputs_free(self) -> tuple[str, ...]:
+        """Those of them in which its form is free."""
+        return self.inputs_named()
+
     def signals(self, system: Any) -> tuple[str, ...]:
         """Arguments of its force at its joint: coordinates, rates, "time", `input_of` a joint."""
         return ()
@@ -314,6 +320,12 @@ class JointEffect(AbstractEffect):
     def signals(self, system):
         own = {"position": system.coordinates, "rate": system.rates}
         return tuple(own[name][self.joint - 1] if name in own else name for name in self.arguments)
+
+    def repeats(self, periods: Scalar, around: SearchScales) -> bool:
+        """True where most of the motion sees one and a half of so many periods a turn: what rises and falls once is a
+        bump, and less a spring or a weight.
+        """
+        return float(periods) * float(around.width[self.joint - 1]) >= 3 * np.pi
 
     def own(self, values: Float[Array, " dof"]) -> Scalar:
         """Entry of an array at its joint."""

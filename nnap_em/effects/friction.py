@@ -34,6 +34,9 @@ class PositionDependentFriction(JointEffect):
         depth = jnp.sqrt(self.sine**2 + self.cosine**2 + 1e-30)
         return {"depth": depth, "n": self.n, "phase": jnp.arctan2(-self.sine, self.cosine)}
 
+    def visible(self, around):
+        return self.repeats(self.n, around)
+
     def friction(self, torque, scene):
         angle = self.n * self.own(scene.q)
         factor = 1 + self.cosine * jnp.cos(angle) + self.sine * jnp.sin(angle)

@@ -3,7 +3,7 @@
 import itertools
 import math
 from abc import abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import ClassVar
 
@@ -75,6 +75,24 @@ class Axis(AbstractAxis):
         return system.unit(name)
 
 
+class Direction(AbstractAxis):
+    """The way in which a joint moves, as dry friction opposes it: the only basis function rises where it turns."""
+
+    responds_to_feedback: ClassVar[bool] = False
+
+    def value(self, scene):
+        return scene.v[scene.system.rates.index(self.names[0])]
+
+    def unit(self, system):
+        return system.unit(self.names[0])
+
+    def acts(self, system):
+        return system.rates.index(self.names[0]) + 1
+
+    def basis(self, value):
+        return jnp.tanh(value / self.high.astype(value.dtype))[None]
+
+
 class InputAxis(AbstractAxis):
     """An input by its column, as it reaches its joint [N m]."""
 
@@ -115,6 +133,7 @@ class UnknownFunction(JointEffect):
         states = [name for name in axes if set(name) <= {*system.coordinates, *system.rates}]
         pairs = (pair for pair in itertools.combinations(states, 2) if set(pair[0]).isdisjoint(pair[1]))
         grids = [(axis,) for axis in (*alone, *turns)] + [(axes[one](6), axes[other](6)) for one, other in pairs]
+        grids += _spots(around, axes)
         # states of a joint and of those next to it: what a force at it may be a function of
         pairs_of = dict(enumerate(zip(system.coordinates, system.rates, strict=True), 1))
         near = {j: {name for other in system.neighbours(j) for name in pairs_of[other]} for j in around.joints}
@@ -126,6 +145,9 @@ class UnknownFunction(JointEffect):
 
     def inputs_named(self):
         return tuple(dict.fromkeys(name for axis in self.axes for name in axis.names))
+
+    def inputs_free(self):
+        return tuple(dict.fromkeys(name for axis in self.axes if axis.count > 1 for name in axis.names))
 
     def signals(self, system):
         return tuple(dict.fromkeys(name for axis in self.axes for name in axis.signals(system)))
@@ -155,11 +177,13 @@ class UnknownFunction(JointEffect):
         return self.at(scene, self.torque([axis.value(scene) for axis in self.axes]))
 
     def curve(self, cov, system):
-        if len(self.axes) != 1:
+        wide = [axis for axis in self.axes if axis.count > 1]
+        if len(wide) != 1:
             return None
-        (axis,) = self.axes
+        (axis,) = wide
         x = np.linspace(float(axis.low), float(axis.high), 121)
-        basis = np.asarray(jax.vmap(axis.basis)(jnp.asarray(x)))
+        against = 1 if len(self.axes) == 1 else -1  # dry friction is drawn as what it takes
+        basis = against * np.asarray(jax.vmap(axis.basis)(jnp.asarray(x)))
         # its mean is that of the nodes, each weighted by how well it is known: what was never visited moves nothing
         variance = np.einsum("xi,ij,xj->x", basis, cov, basis)
         basis = basis - np.average(basis, axis=0, weights=1 / np.maximum(variance, 1e-12 * variance.max() + 1e-300))
@@ -184,6 +208,13 @@ def _function(joint: int, axes: tuple[AbstractAxis, ...], around: SearchScales) 
     make = lambda w: UnknownFunction(jnp.asarray(w, float), axes, joint=joint)  # noqa: E731
     probes = tuple(make(0.05 * size * row) for row in np.eye(number))
     return Candidate(make(np.zeros(number)), probes, make(np.full(number, 0.3 * size)))
+
+
+def _spots(around: SearchScales, axes: Mapping[tuple[str, ...], Callable]) -> list[tuple[AbstractAxis, ...]]:
+    """Dry friction at some angles: a function of a coordinate and of the direction in which it moves."""
+    names = zip(around.system.coordinates, around.system.rates, around.speed, strict=True)
+    knees = ((q, v, 0.02 * float(speed)) for q, v, speed in names if (q,) in axes)
+    return [(axes[q,](20), Direction((v,), -knee, knee, False, 1)) for q, v, knee in knees]
 
 
 def _axes(around: SearchScales) -> dict[tuple[str, ...], Callable[[int], AbstractAxis]]:

@@ -102,8 +102,7 @@ class Cogging(JointEffect):
         return float(self.k) > 0.7 and abs(float(self.k) - float(self.near)) < 0.3
 
     def visible(self, around):
-        """One and a half periods at least: what rises and falls once is a bump, and less a spring or a weight."""
-        return float(self.near) * float(around.high[self.joint - 1] - around.low[self.joint - 1]) >= 3 * np.pi
+        return self.repeats(self.near, around)
 
     def force(self, scene, memory):
         angle = self.k * self.own(scene.q)

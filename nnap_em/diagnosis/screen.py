@@ -24,7 +24,7 @@ from .columns import blocks_of
 from .keys import complexity
 from .losses import BANDS, Linearised, linearise
 from .smoothed import SmoothedFit
-from .verdict import CHANCE, MULTI_STEP, REPEATS, SURVIVES, Share, agreed, required
+from .verdict import CHANCE, REPEATS, SURVIVES, Share, agreed, least_share, required
 
 SHIFTS = 2
 """Placebos whose largest share is the chance level."""
@@ -306,9 +306,8 @@ def screen(fit: SmoothedFit, candidates: Sequence[Candidate]) -> tuple[Screened,
     """Every candidate at the first band of horizons that shows it, else at that of the largest multiple of its bar.
     Bands are in the order of what they prove: errors soon after a start show more of what else a model lacks.
     """
-    # a later law must remove the floor of the first error, not of what earlier ones left of it
     removed = [evidence.removed for evidence in fit.hypothesis.evidence if evidence is not None]
-    out, floor = [], MULTI_STEP / math.prod(1 - share for share in removed if math.isfinite(share))
+    out, floor = [], least_share([share for share in removed if math.isfinite(share)])
     for number, (real, *moved) in enumerate(_bands(fit, candidates)):
         placebos = [s for one in moved for s in _screened(one, candidates, number, floor, 0.0)]
         chance = max([0.0, *(s.listed for s in placebos)])

@@ -131,6 +131,10 @@ def test_a_suspect_is_named_with_its_share_and_the_chance_level():
     assert suspect["description"] == f"motor gain at joint 2 {removes}"
     assert verdict([], None, 3, (), [suspect]).startswith("No effect is certain to be missing. Suspected: motor gain")
     assert "certain" not in verdict([], None) and not suspected(_closed(ARM))
+    errs = "Something is missing in the model: x errs by 1 m."
+    text = verdict([], None, 3, (), [suspect], misfit=errs, tried=97)
+    assert text.startswith(f"{errs} None of 97 laws tried explains it for certain. Suspected: motor gain")
+    assert verdict([], None, 3, misfit=errs, tried=97) == f"{errs} None of 97 laws tried explains it."
     assert (
         advice([], (), [suspect])[1] == f"To see a motor gain at joint 2 by itself: {catalogue['motor_gain'].confirm}"
     )

@@ -108,11 +108,14 @@ def verdict(
     suspects: Sequence[Mapping[str, Any]] = (),
     unfinished: str = "",
     opening: str = "The model lacks",
+    misfit: str = "",
+    tried: int = 0,
 ) -> str:
     """The outcome in one sentence; `failed` tests of the one-step errors of the declared model failed clearly, `rivals`
     explain the same of what is left, and `suspects` remove more than chance. A second one has the reason for which the
     search is `unfinished`. `opening` begins the sentence that names laws. It names the column whose test error falls
-    most, and trusts a finding where the geometric mean over all falls.
+    most, and trusts a finding where the geometric mean over all falls. Where none of the laws `tried` explains what
+    predictions err, the sentence `misfit`, that comes first.
     """
     if unfinished:
         known = accepted or rivals or suspects
@@ -124,7 +127,14 @@ def verdict(
     if not accepted and suspects:
         first, *remaining = suspects
         others = f" ({len(remaining)} more below)" if remaining else ""
-        return f"No effect is certain to be missing. Suspected: {first['description']}{others}."
+        none = (
+            f"{misfit} None of {tried} laws tried explains it for certain."
+            if misfit
+            else "No effect is certain to be missing."
+        )
+        return f"{none} Suspected: {first['description']}{others}."
+    if not accepted and misfit:
+        return f"{misfit} None of {tried} laws tried explains it."
     if not accepted and failed:
         none = "No single effect of the catalogue is certain to be missing, but the declared model does not explain"
         return f"{none} everything: {failed} tests of its one-step errors fail."

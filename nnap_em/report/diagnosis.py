@@ -66,14 +66,15 @@ def write_diagnosis(
     ]
     rivals, suspects = undecided(diagnosis), suspected(diagnosis)
     failed = sum(t.p_value < 0.01 and not t.slight for t in tested["before"])
-    outcome, after = verdict(accepted, error, failed, rivals, suspects, diagnosis.unfinished), diagnosis.after
+    after, tried = diagnosis.after, len({key for step in diagnosis.steps for key, _ in step.screened})
     far, misfit = moved(after.rig, after.m_step.prior, after.model), after.misfit
+    outcome = verdict(accepted, error, failed, rivals, suspects, diagnosis.unfinished, misfit=misfit.text, tried=tried)
     if diagnosis.change:
         outcome, far = changes(diagnosis, accepted, error), []
     command = "nnap-em design FIT --out NEXT, FIT this folder: the most informative inputs, ready to be played."
     designed = [command] if diagnosis.before.rig.input_columns and not diagnosis.before.rig.equations else []
     document = shared(diagnosis.before, train, test, seed=seed, began=began) | {
-        "verdict": " ".join([outcome, *[misfit.text] * bool(misfit.text), *(one.sentence for one in far)]),
+        "verdict": " ".join([outcome, *[misfit.text] * (misfit.text not in outcome), *(one.sentence for one in far)]),
         "misfit": [misfit.text] if misfit.useless else [],
         "accuracy": {name: fitted.misfit for name, fitted in both.items()},
         "moved": far,

@@ -751,10 +751,10 @@ the larger of two shares
 a refit that removes next to nothing
 - return share >= KEEP * floor
 + return share >= 0
-## test_verdict.py::test_a_later_law_removes_the_floor_of_the_first_error_or_much_of_what_is_left
+## test_verdict.py::test_a_later_law_removes_much_of_what_is_left_and_something_of_the_first_error
 a later law removes the floor of the first error, however little is left
-- for share in removed), LATER)
-+ for share in removed), 1e9)
+- MULTI_STEP / math.sqrt(
++ MULTI_STEP / float(
 ## test_verdict.py::test_a_remainder_comes_before_a_named_law_and_that_before_a_free_one
 free laws before named ones
 - NAMED ** (1 + complexity)

@@ -56,11 +56,6 @@ MULTI_STEP = 0.15
 rigs as recorded, and below it an effect that is not in the catalogue looks like some law that is."""
 
 
-LATER = 0.3
-"""The same of what accepted laws have left, however little that is: there named aliases remove up to 0.27 on real rigs
-with planted effects, true second laws 0.38 and more."""
-
-
 class Share(NamedTuple):
     """Part of the squared error that a candidate removes."""
 
@@ -90,10 +85,11 @@ def odds(complexity: int) -> float:
 
 
 def least_share(removed: Sequence[float]) -> float:
-    """Smallest share of the error that counts beside accepted laws, which have `removed` these of what was there: that
-    of the first error, as far as such a part is left at all.
+    """Smallest share that counts of the error that accepted laws leave, which have `removed` these of what was there.
+    Of the first error a second law can be no large part where one explains most, of what is left any alias may be one
+    where little is: the geometric mean of both shares must reach the floor.
     """
-    return min(MULTI_STEP / math.prod(1 - share for share in removed), LATER)
+    return MULTI_STEP / math.sqrt(math.prod(1 - share for share in removed))
 
 
 def required(bar: float, complexity: int) -> float:

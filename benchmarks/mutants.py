@@ -404,8 +404,8 @@ the next effect dropped
 # diagnosis/keys.py
 ## test_search.py::test_a_rest_belongs_to_the_law_of_the_same_signals_at_its_joint
 rest of a law at another joint
-- first == second and one.joint == other.joint
-+ first == second
+- inside and free.joint == law.joint and
++ inside and
 ## test_search.py::test_a_function_of_each_turn_and_one_of_all_turns_are_rivals
 a law takes the place of its like
 - jax.tree.structure(model.effects[i]) != jax.tree
@@ -855,13 +855,22 @@ a bump is a cogging
 # effects/friction.py
 ## test_inputs.py::test_what_is_not_seen_to_repeat_has_no_periods
 friction by angle need not repeat
-- return self.repeats(self.n, around)
+- return self.repeats(self.near, around)
 + return True
-# effects/function.py
 ## test_inputs.py::test_dry_friction_at_an_angle_is_one_free_function_against_the_motion
 a form that is known has a price
-- if axis.count > 1 for name in axis.names
-+ for name in axis.names
+- return self.axis.names
++ return self.inputs_named()
+# diagnosis/keys.py
+## test_inputs.py::test_dry_friction_at_an_angle_is_one_free_function_against_the_motion
+dry friction stands for a brake
+- and law.dry >= free.dry
++ and True
+# diagnosis/propose.py
+## test_inputs.py::test_a_joint_is_seen_where_it_moves
+rest is seen
+- np.nanpercentile(moving,
++ np.nanpercentile(mean[:, :dof],
 # diagnosis/backward.py
 ## test_search.py::test_a_law_of_a_rate_is_judged_by_that_reading_too
 a law of a rate is judged by the coordinates alone

@@ -282,7 +282,7 @@ def _head(names: Sequence[str]) -> list[str]:
 
 
 def table(records: Sequence[Entry]) -> str:
-    """Sums of all cases as Markdown: by strength, and of the rigs as recorded."""
+    """Sums of all cases as Markdown: by what is visible, and of the rigs as recorded."""
     controls = {r["truth"]["rig"]: r for r in records if r["truth"]["strength"] == "none"}
     scores = {r["case"]: score(r, controls) for r in records}
     planted = [s for s in scores.values() if s.strength in STRENGTHS]
@@ -291,7 +291,7 @@ def table(records: Sequence[Entry]) -> str:
     groups = {
         f"error raised {SHOUTS:g} times and more": [s for s in planted if s.grown("before") >= SHOUTS],
         f"{VISIBLE} times and more (visible)": [s for s in planted if s.grown("before") >= VISIBLE],
-        "less": [s for s in planted if s.grown("before") < VISIBLE],
+        "less, or not known": [s for s in planted if not s.grown("before") >= VISIBLE],
         "two effects": [s for s in planted if s.truths == 2],
         "off the catalogue": [s for s in planted if s.case in outside],
         "joint 2 hidden": [s for s in planted if s.case in hidden],

@@ -100,6 +100,7 @@ CRUDE = {"hard_stop": 1e-3}
 NOT_COMPARED = {
     "sensor_quantization": "as noise it moves no mean",
     "unknown_function": "it has no form; its parts are tested below",
+    "dry_friction": "tests/test_inputs.py has its formula",
     **dict.fromkeys(("sensor_bias", "sensor_scale"), "tests/test_planted.py has their readings"),
     **dict.fromkeys(("coulomb_change", "viscous_change", "change"), "tests/test_changed.py changes a machine"),
 }

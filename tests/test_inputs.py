@@ -1,5 +1,7 @@
 """Signals of a law: every input is its own, any number of joints, and the free form of a law is of the same ones."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,7 +11,7 @@ import pytest
 from nnap_em.data.dataset import Dataset
 from nnap_em.data.rig import Declared, Rig
 from nnap_em.diagnosis.hypothesis import Hypothesis
-from nnap_em.diagnosis.keys import complexity
+from nnap_em.diagnosis.keys import completed, complexity, contains, remainder_of
 from nnap_em.diagnosis.propose import proposals, surroundings
 from nnap_em.diagnosis.screen import screen
 from nnap_em.diagnosis.smoothed import SmoothedFit
@@ -120,53 +122,73 @@ def test_every_law_of_a_place_a_rate_or_an_input_has_a_free_form(plain):
 def test_what_is_not_seen_to_repeat_has_no_periods(plain):
     """The 2 rad where it mostly is hold more than one and a half of five periods a turn, and less of 4.5."""
     around = plain[-1]._replace(width=2 * np.ones(2), learned=True)
-    for law, periods in (("cogging", "near"), ("position_dependent_friction", "n")):
-        of = [c.start for c in catalogue[law].candidates(around) if c.start.joint == 2]
-        seen = {float(getattr(one, periods)): one.visible(around) for one in of}
+    for law in ("cogging", "position_dependent_friction"):
+        seen = {
+            float(c.start.near): c.start.visible(around)
+            for c in catalogue[law].candidates(around)
+            if c.start.joint == 2
+        }
         assert seen[5.0] and seen[max(seen)] and not any(seen[k] for k in seen if k < 4.6)
 
 
 def _spots(around):
-    """Dry friction at some angles."""
-    every = [c for c in catalogue["unknown_function"].candidates(around) if isinstance(c.start, UnknownFunction)]
-    return {c.start.joint: c for c in every if c.start.axes[-1].count == 1}
+    """Dry friction at some angles, by its joint."""
+    return {c.start.joint: c for c in catalogue["dry_friction"].candidates(around._replace(learned=True))}
 
 
 def test_dry_friction_at_an_angle_is_one_free_function_against_the_motion(plain):
-    """Its formula; in its price its form along the rate, which is known, does not count."""
+    """Its formula; its price is that of one signal; and what a law without a form may stand for."""
     spots, system = _spots(plain[-1]), plain[0].system
     assert {joint: c.start.inputs_named() for joint, c in spots.items()} == {
         j: (f"theta{j}", f"dtheta{j}") for j in (1, 2)
     }
-    both = catalogue["unknown_function"].candidates(plain[-1])
-    prices = {complexity(c.start) for c in both if c.start.inputs_named() == ("theta2", "dtheta2")}
-    assert complexity(spots[2].start) == 1 and prices == {1, 2}
-    angle, knee = spots[2].start.axes
-    weights = 0.1 * np.sin(np.arange(20.0))
-    law = UnknownFunction(jnp.asarray(weights), spots[2].start.axes, joint=2)
+    both = next(
+        c.start
+        for c in catalogue["unknown_function"].candidates(plain[-1])
+        if (c.start.joint, c.start.inputs_named()) == (2, ("theta2", "dtheta2"))
+    )
+    weights, axis = 0.1 * np.sin(np.arange(20.0)), spots[2].start.axis
+    law = dataclasses.replace(spots[2].start, weights=jnp.asarray(weights))
+    assert (complexity(law), complexity(both), complexity(law, with_effects(plain[0], (both,)))) == (1, 2, 1)
     none = jnp.zeros(2)
     for at, rate in ((0.3, 2.0), (0.3, -2.0), (-0.1, 0.01)):
         q, v = jnp.array([1.0, at]), jnp.array([0.5, rate])
         scene = OperatingPoint(system, q, v, none, jnp.zeros(()), none, lambda _: none)
-        size = weights @ np.asarray(angle.basis(jnp.asarray(at)))
-        np.testing.assert_allclose(law.force(scene, none), [0.0, size * np.tanh(rate / float(knee.high))], rtol=1e-12)
+        taken = weights @ np.asarray(axis.basis(jnp.asarray(at)))
+        np.testing.assert_allclose(law.force(scene, none), [0.0, -taken * np.tanh(rate / float(law.knee))], rtol=1e-12)
+    wave, brake = (catalogue[name].of(*numbers, joint=2) for name, numbers in FORMS_OF_FRICTION.items())
+    for free, named, ok in ((law, wave, True), (law, brake, False), (both, wave, True), (both, brake, True)):
+        assert contains(free, named, system) == ok == (remainder_of(free, with_effects(plain[0], (named,))) == 0)
+        assert completed(named, with_effects(plain[0], (free,))) == ok
+
+
+FORMS_OF_FRICTION = {"position_dependent_friction": (0.1, 0.2, 3.0, 3.0), "eddy_brake": (0.1, 0.2)}
 
 
 def test_a_spot_of_dry_friction_is_found_as_one(plain):
     """Beside functions of two signals and friction that repeats with the angle, which explain a part of it."""
     spot = _spots(plain[-1])[2].start
-    centre = np.asarray(spot.axes[0].centres())
-    weights = -0.3 * np.exp(-0.5 * ((centre - np.median(centre)) / 0.1) ** 2)
-    law = UnknownFunction(jnp.asarray(weights), spot.axes, joint=2)
-    drawn, asked = law.curve(np.eye(20), plain[0].system), _asked((law,))
-    assert drawn.x[np.argmax(drawn.mean)] == pytest.approx(np.median(centre), abs=0.06)  # what it takes
-    rivals = [c for c in proposals(asked[-1]) if c.start.joint == 2 and len(c.start.signals(plain[0].system)) == 2]
-    shares = {
-        (complexity(c.start), c.start.name): v.share.least
-        for c, v in zip(rivals, _screened(asked, rivals), strict=True)
-    }
-    best = max(shares, key=shares.__getitem__)
-    assert best == (1, "unknown_function"), shares
+    centre = np.asarray(spot.axis.centres())
+    weights = 0.3 * np.exp(-0.5 * ((centre - np.median(centre)) / 0.1) ** 2)
+    law = dataclasses.replace(spot, weights=jnp.asarray(weights))
+    drawn = law.curve(np.eye(20), plain[0].system)
+    assert drawn.of == "dry friction" and drawn.x[np.argmax(drawn.mean)] == pytest.approx(np.median(centre), abs=0.06)
+    asked = _asked((law,))
+    every = proposals(asked[-1]._replace(learned=True))
+    rivals = [c for c in every if c.start.joint == 2 and len(c.start.signals(plain[0].system)) == 2]
+    best = max(zip(_screened(asked, rivals), rivals, strict=True), key=lambda pair: pair[0].share.least)[1].start
+    assert best.name == "dry_friction"
+
+
+def test_a_joint_is_seen_where_it_moves(plain):
+    """At rest for three quarters of the time, it repeats what it does in the rest of it."""
+    model, _, data, path, _ = plain
+    rest = 3 * ROWS // 4
+    mean = np.asarray(path.mean).copy()
+    mean[..., 1] = np.append(np.zeros(rest), np.linspace(-1.0, 1.0, ROWS - rest))
+    mean[..., 3] = np.append(np.zeros(rest), np.full(ROWS - rest, 3.0))
+    seen = surroundings(RIG, model, data, path._replace(mean=jnp.asarray(mean)), ROWS).width[1]
+    assert seen == pytest.approx(0.9 * 2.0, rel=0.05)
 
 
 def test_a_spring_is_straight_beyond_what_was_seen():

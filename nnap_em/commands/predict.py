@@ -30,7 +30,8 @@ def run(args: argparse.Namespace, log: Log) -> int:
     logs = read_logs(args.folder, fitted.rig, trust=args.trust_readings, until=args.given)
     known, valid = given_samples(logs.data, args.given), np.asarray(logs.data.valid)
     if ended := [file for file, ahead in zip(logs.files, valid & ~known, strict=True) if not ahead.any()]:
-        problem = f"no row of {listed(ended)} is later than --given {args.given:g} s: nothing is predicted there"
+        given = f"{args.given:g} {fitted.rig.time_unit}"
+        problem = f"no row of {listed(ended)} is later than --given {given}: nothing is predicted there"
         warnings.warn(f"{args.folder}: {problem}", DataWarning, 2)
     prediction = predict(fitted, logs.data, args.given, key=jax.random.key(args.seed))
     mean, std = np.asarray(prediction.mean), np.asarray(prediction.std)

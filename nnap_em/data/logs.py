@@ -139,8 +139,8 @@ def sequences_of(data: Dataset | Logs, rig: Rig) -> Dataset:
     uneven = np.abs(steps - np.maximum(np.round(steps), 1)) > TOLERANCE
     if uneven.any() or np.median(steps) > 1 + TOLERANCE:
         i, k = np.argwhere(uneven if uneven.any() else steps > 1 + TOLERANCE)[0]
-        problem = f"sequence {i}, row {k + 1}: t goes from {t[i, k]:.6g} to {t[i, k + 1]:.6g} s"
-        raise DataError(f"{problem}, the rig has dt = {rig.dt:g} s; resample to uniform rows, or correct dt")
+        problem = f"sequence {i}, row {k + 1}: t goes from {t[i, k]:.6g} to {t[i, k + 1]:.6g} {rig.time_unit}"
+        raise DataError(f"{problem}, the rig has dt = {rig.dt:g}; resample to uniform rows, or correct dt")
     if (dark := valid & ~np.isfinite(u).all(axis=-1)).any():
         i, k = np.argwhere(dark)[0]
         raise DataError(f"sequence {i}, row {k}: u is no number; give it in every row (NaN in y is a missing reading)")
@@ -243,7 +243,8 @@ def _without(source: _Table, entries: Iterable[Rough], rig: Rig) -> _Table:
         if rows.size:
             line, t = int(source.line[rows[0]]), float(table[rows[0], 0])
             table[rows, rig.measured.index(column) - len(rig.measured)] = np.nan
-            problem = f"{counted(rows.size, 'reading')} {_REASONS[kind]} ({kind}), the first at {t:.6g} s; not used"
+            first = f"the first at {t:.6g} {rig.time_unit}"
+            problem = f"{counted(rows.size, 'reading')} {_REASONS[kind]} ({kind}), {first}; not used"
             hint = "" if kind == RANGE else "; to use them: --trust-readings, or read_logs(..., trust=True)"
             warnings.warn(f"{source.path}: {place(source.path, column, line)}: {problem}{hint}", DataWarning, 2)
             masked.append(Masked(source.path.name, kind, column, line + 1, t, rows.size))
@@ -259,8 +260,8 @@ def _read_table(path: Path, rig: Rig) -> _Table:
             hint = "`nnap-em import` it: each becomes a sequence"
             refuse(path, place(path, name, changes[0] + 1), "another episode begins", hint)
     if not clock:
-        problem = f"no column of times: rows are taken as dt = {rig.dt:g} s apart"
-        warnings.warn(f"{path}: {problem}; log the time [s], so that lost rows show", DataWarning, 2)
+        problem = f"no column of times: rows are taken as dt = {rig.dt:g} {rig.time_unit} apart"
+        warnings.warn(f"{path}: {problem}; log the time [{rig.time_unit}], so that lost rows show", DataWarning, 2)
         table = np.column_stack([rig.dt * np.arange(len(table)), table])
     _check_scales(path, table, rig)
     return _whole(path, table, _rows(path, table[:, 0], rig), rig)
@@ -295,7 +296,12 @@ def _rows(path: Path, t: Float[np.ndarray, " time"], rig: Rig) -> Int[np.ndarray
     typical = np.median(steps)
     if abs(typical - 1) > TOLERANCE and abs(steps.mean() - 1) > TOLERANCE:
         hint = other_unit(float(typical), "correct [sampling] dt of rig.toml, or resample with `nnap-em import`")
-        refuse(path, "column 'time'", f"rows are {typical * rig.dt:.6g} s apart, rig.toml says {rig.dt:g} s", hint)
+        refuse(
+            path,
+            "column 'time'",
+            f"rows are {typical * rig.dt:.6g} {rig.time_unit} apart, rig.toml says {rig.dt:g}",
+            hint,
+        )
     intervals = np.maximum(np.round(steps), 1)
     wrong = np.abs(steps - intervals) > TOLERANCE
     missing = int(np.sum(intervals[~wrong] - 1))
@@ -304,12 +310,12 @@ def _rows(path: Path, t: Float[np.ndarray, " time"], rig: Rig) -> Int[np.ndarray
     if wrong.any():
         k, count = np.flatnonzero(wrong)[0], wrong.sum()
         kind = "time does not run on" if steps[k] <= 0 else "a gap" if steps[k] > 1.5 else "jitter"
-        problem = f"{kind}: {t[k]:.9g} s, then {t[k + 1]:.9g} s ({counted(count, 'place')} in all)"
+        problem = f"{kind}: {t[k]:.9g} {rig.time_unit}, then {t[k + 1]:.9g} ({counted(count, 'place')} in all)"
         hint = "resample to uniform rows with `nnap-em import`; a missing sample is an empty field of a row"
-        refuse(path, place(path, "time", int(k) + 1), problem, f"{hint} (dt = {rig.dt:g} s)")
+        refuse(path, place(path, "time", int(k) + 1), problem, f"{hint} (dt = {rig.dt:g} {rig.time_unit})")
     if rig.clock == "sequence" and abs(t[0]) > TOLERANCE * rig.dt:
         hint = 'subtract it, or declare [sampling] clock = "session" in rig.toml'
-        refuse(path, place(path, "time", 0), f"starts at {t[0]:.9g} s, not at 0", hint)
+        refuse(path, place(path, "time", 0), f"starts at {t[0]:.9g} {rig.time_unit}, not at 0", hint)
     return np.append(0, np.cumsum(intervals)).astype(int)
 
 
@@ -334,7 +340,7 @@ def _whole(path: Path, table: Float[np.ndarray, "row column"], rows: Int[np.ndar
         if count:
             k = int(np.searchsorted(rows, first))  # the row of the file after the gap
             masked.append(Masked(path.name, kind, None, k + 1, float(full[first, 0]), count))
-            problem = f"a gap: {table[k - 1, 0]:.9g} s, then {table[k, 0]:.9g} s"
+            problem = f"a gap: {table[k - 1, 0]:.9g} {rig.time_unit}, then {table[k, 0]:.9g}"
             problem += f" ({counted(count, 'row')} {'missing' if kind == 'gap' else 'after it'} in all)"
             warnings.warn(f"{path}: {place(path, 'time', k)}: {problem}; {hint}", DataWarning, 2)
     return _Table(path, full[:end], used, masked)

@@ -153,7 +153,7 @@ class Rig:
         noise = {name: f"{std:.2g} {self.unit(name)}" for name, std in self.noise_std.items()}
         reads = [f"{name} (noise {noise.get(name, 'to be estimated')})" for name in self.measured]
         lines = [
-            f"Rig {self.name!r}: {self.system}, a row every {self.dt:g} s",
+            f"Rig {self.name!r}: {self.system}, a row every {self.dt:g} {self.time_unit}",
             f"parameters: {quantities(self.parameters, self.unit) or 'as in the file'}",
             f"inputs: {', '.join(inputs) or 'none'}",
             f"reads: {', '.join(reads)}",

@@ -119,7 +119,8 @@ def verdict(
     """
     if unfinished:
         known = accepted or rivals or suspects
-        first = verdict(accepted, error, failed, rivals, suspects) if known else "No effect was found yet."
+        said: dict[str, Any] = {"misfit": misfit, "tried": tried}
+        first = verdict(accepted, error, failed, rivals, suspects, **said) if known else "No effect was found yet."
         return f"{first} {unfinished}: more may be missing."
     if not accepted and rivals:
         same = f"{listed([*map(words, rivals)])} explain the same; none is added."
@@ -133,7 +134,7 @@ def verdict(
             else "No effect is certain to be missing."
         )
         return f"{none} Suspected: {first['description']}{others}."
-    if not accepted and misfit:
+    if not accepted and misfit and tried:
         return f"{misfit} None of {tried} laws tried explains it."
     if not accepted and failed:
         none = "No single effect of the catalogue is certain to be missing, but the declared model does not explain"
@@ -230,9 +231,8 @@ def _alone(finding: Finding) -> str:
     if sizes or curve is None:
         return f"{name} ({' = '.join(next(iter(sizes.items())))})" if sizes else name
     if not finding.effect.named:
-        free, kind = finding.effect.inputs_free(), "a force" if curve.unit == "N" else "a torque"
-        kind = kind if free == finding.effect.inputs_named() else "dry friction"
-        name = f"{kind} at joint {finding.effect.joint} that depends on {listed(free)}"
+        kind = "dry friction" if finding.effect.dry else "a force" if curve.unit == "N" else "a torque"
+        name = f"{kind} at joint {finding.effect.joint} that depends on {listed(finding.effect.inputs_free())}"
     return f"{name} ({number(float(f'{np.ptp(curve.mean):.2g}'), 2)} {curve.unit} from trough to peak)"
 
 

@@ -51,7 +51,7 @@ def listed(names: Sequence[str]) -> str:
 
 def remainder_of(effect: AbstractEffect, model: StateSpaceModel) -> int | None:
     """Place of the named law whose rest an unnamed one is: a function of the same signals at the same joint."""
-    laws = (i for i, e in enumerate(model.effects) if e.named and _same_signals(e, effect, model))
+    laws = (i for i, e in enumerate(model.effects) if e.named and contains(effect, e, model.system))
     return None if effect.named else next(laws, None)
 
 
@@ -65,7 +65,7 @@ def replaced(effect: AbstractEffect, model: StateSpaceModel) -> int | None:
 
 def completed(effect: AbstractEffect, model: StateSpaceModel) -> bool:
     """True if an unnamed law in the model is a function of the same signals at the same joint as a named one."""
-    return effect.named and any(not e.named and _same_signals(e, effect, model) for e in model.effects)
+    return effect.named and any(contains(e, effect, model.system) for e in model.effects)
 
 
 def complexity(law: AbstractEffect, model: StateSpaceModel | None = None) -> int:
@@ -84,12 +84,9 @@ def elsewhere(one: Key, other: Key) -> bool:
 
 
 def contains(free: AbstractEffect, law: AbstractEffect, system: AbstractSystem) -> bool:
-    """True where a function at a joint can be what `law` is: a named law of its signals, or a function of fewer."""
+    """True where a function at a joint can be what `law` is: a named law of its signals, or a function of fewer; one of
+    dry friction only what is dry.
+    """
     signals, of_law = (set(effect.signals(system)) for effect in (free, law))
     inside = of_law == signals if law.named else of_law < signals
-    return not free.named and bool(of_law) and inside and free.joint == law.joint
-
-
-def _same_signals(one: AbstractEffect, other: AbstractEffect, model: StateSpaceModel) -> bool:
-    first, second = (set(effect.signals(model.system)) for effect in (one, other))
-    return bool(first) and first == second and one.joint == other.joint
+    return not free.named and bool(of_law) and inside and free.joint == law.joint and law.dry >= free.dry

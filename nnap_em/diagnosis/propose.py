@@ -29,10 +29,11 @@ def surroundings(
     scales, dof = measure_scales(rig, model.system, data), len(model.system.coordinates)
     y, valid = np.asarray(data.y), np.asarray(data.valid)
     mean, clock = np.asarray(path.mean)[valid & np.isfinite(np.asarray(path.mean)).all(-1)], np.asarray(data.t)[valid]
-    low, early, late, high = np.percentile(mean[:, :dof], [0.5, 5.0, 95.0, 99.5], axis=0)
+    low, high = np.percentile(mean[:, :dof], [0.5, 99.5], axis=0)
     drive = np.nan_to_num(np.asarray(each(_drives, with_effects(model, ()), (path.mean, data))))
     drive = np.max(np.abs(np.where(valid[..., None], drive, 0.0)), axis=(0, 1), initial=0.0)
     speed = np.percentile(np.abs(mean[:, dof : 2 * dof]), 99.5, axis=0) + 1e-9
+    moving = np.where(np.abs(mean[:, dof : 2 * dof]) > 0.02 * speed, mean[:, :dof], np.nan)
     ends = jnp.asarray(np.outer([1.0, 0.4, -0.4, -1.0], speed))
     fast, slow, back, fast_back = np.asarray(_torques(model.unknown, ends))
     # what rises between 0.4 and 1 of the top speed, on both sides, is not dry friction any more: the viscous slope
@@ -42,7 +43,7 @@ def surroundings(
         model.system, scales.torque, speed, viscous, low, high, drive[[joint - 1 for joint in model.system.joints]],
         rig.measured, np.asarray([np.nanstd(y[..., i]) + 1e-9 for i in range(y.shape[-1])]), rig.dt,
         (float(clock.min()), float(clock.max())), ending, rig.clock == "session", rig.friction, rig.input_columns,
-        moved=moved if change else None, width=late - early,
+        moved=moved if change else None, width=np.ptp(np.nanpercentile(moving, [5.0, 95.0], axis=0), axis=0),
         dry=np.maximum(0.5 * np.abs(slow - back) - 0.4 * viscous * speed, 0.01 * scales.torque),
     )  # fmt: skip
 

@@ -71,7 +71,9 @@ class SearchScales(NamedTuple):
     moved: tuple[tuple[str, str, float], ...] | None = None
     """Estimated numbers of the machine with unit and size, where the question is what changed since a fit."""
     width: Float[np.ndarray, " dof"] = np.zeros(0)
-    """Range in which every coordinate is for nine tenths of the time [rad]: what lies beyond repeats nothing."""
+    """Range in which every coordinate is for nine tenths of the time in which it moves [rad]: what a rare swing alone
+    sees is no repetition. In all of its range a bump of a real arm is a cogging of 4.3 periods a turn.
+    """
     dry: Float[np.ndarray, " dof"] = np.zeros(0)
     """Dry friction of the learned map: its odd part at 0.4 of the largest velocity, less the viscous one [N m]."""
 
@@ -141,6 +143,8 @@ class Curve(NamedTuple):
     std: Float[np.ndarray, " node"]
     basis: Float[np.ndarray, "node basis"] | None = None
     """Functions whose sum the curve is; None: the values as they stand."""
+    of: str = "force"
+    """What it is: a force, or friction that it takes."""
 
 
 class Stream(NamedTuple):
@@ -184,6 +188,8 @@ class AbstractEffect(eqx.Module):
     """False where a probe itself, not its multiple, is the place to start a fit from."""
     held: ClassVar[bool] = False
     """True for a force with many parameters: their sensitivity is that of a force held over the step."""
+    dry: ClassVar[bool] = False
+    """True for friction that the place and the direction of the motion decide, as far as the learned map does not."""
     read_off: ClassVar[bool] = False
     """True for what is seen in the numbers themselves, before any fit."""
 

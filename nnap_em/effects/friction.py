@@ -9,8 +9,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from .base import AbstractEffect, Candidate, JointEffect, Scalar, a, fields, input_of, known, one, pair
+from .function import Axis, axes_of, drawn
 
 
 class PositionDependentFriction(JointEffect):
@@ -19,28 +21,79 @@ class PositionDependentFriction(JointEffect):
     meaning: ClassVar[str] = "Friction is stronger at some angles than at others."
     confirm: ClassVar[str] = "Turn the joint slowly through its range and log the torque that it takes."
     units: ClassVar[dict[str, str]] = {"depth": "-", "n": "-", "phase": "rad"}
+    dry: ClassVar[bool] = True
     words: ClassVar[dict[str, str]] = {"depth": "relative depth", "n": "periods per turn", "phase": "phase"}
     arguments: ClassVar[tuple[str, ...]] = ("position", "rate")
     cosine: Scalar
     sine: Scalar
     n: Scalar
+    near: Scalar = known(default=1.0)
+    """Value of n at which it was found; far from it the law is a different one."""
 
     @classmethod
     def candidates(cls, around):
         turning = around.turning if around.learned else []
-        return [pair(partial(cls.of, joint=j), 0.1, 1.0, (n, 0.3)) for j in turning for n in np.arange(1.0, 7.0)]
+        make = lambda n, j: lambda c, s, m: cls.of(c, s, m, n, joint=j)  # noqa: E731
+        return [pair(make(n, j), 0.1, 1.0, (n, 0.3)) for j in turning for n in np.arange(1.0, 7.0)]
 
     def values(self):
         depth = jnp.sqrt(self.sine**2 + self.cosine**2 + 1e-30)
         return {"depth": depth, "n": self.n, "phase": jnp.arctan2(-self.sine, self.cosine)}
 
+    def is_physical(self):
+        return abs(float(self.n) - float(self.near)) < 0.5  # half of the way to the next start
+
     def visible(self, around):
-        return self.repeats(self.n, around)
+        return self.repeats(self.near, around)
 
     def friction(self, torque, scene):
         angle = self.n * self.own(scene.q)
         factor = 1 + self.cosine * jnp.cos(angle) + self.sine * jnp.sin(angle)
         return torque.at[self.joint - 1].multiply(factor)
+
+
+class DryFriction(JointEffect):
+    """-f(theta_j) sign(w_j), f free: what some angles take beside the learned map."""
+
+    reported_as: ClassVar[str] = "unknown_function"
+    meaning: ClassVar[str] = "Dry friction that depends on the angle, as of a worn tooth or a dented bearing."
+    named: ClassVar[bool] = False
+    confirm: ClassVar[str] = PositionDependentFriction.confirm
+    held: ClassVar[bool] = True
+    dry: ClassVar[bool] = True
+    arguments: ClassVar[tuple[str, ...]] = ("position", "rate")
+    weights: Float[Array, " basis"]
+    axis: Axis
+    knee: Scalar = known()
+    """Rate over which the sign is smoothed [rad/s]."""
+    rate: str = eqx.field(static=True, kw_only=True)
+    """Name of w_j."""
+
+    @classmethod
+    def candidates(cls, around):
+        places, out = axes_of(around), []
+        for j, (name, rate) in enumerate(zip(around.system.coordinates, around.system.rates, strict=True), 1):
+            if not around.learned or (name,) not in places:
+                continue
+            axis, size = places[name,](20), float(around.torque[j - 1])
+            knee = 0.02 * float(around.speed[j - 1])  # as of a friction that grows with torque
+            make = partial(cls, axis=axis, knee=knee, rate=rate, joint=j)
+            probes = tuple(make(jnp.asarray(0.05 * size * row)) for row in np.eye(axis.count))
+            out.append(Candidate(make(jnp.zeros(axis.count)), probes, make(jnp.full(axis.count, 0.3 * size))))
+        return out
+
+    def inputs_named(self):
+        return *self.axis.names, self.rate
+
+    def inputs_free(self):
+        return self.axis.names
+
+    def force(self, scene, memory):
+        taken = self.weights @ self.axis.basis(self.own(scene.q))
+        return self.at(scene, -taken * jnp.tanh(self.own(scene.v) / self.knee))
+
+    def curve(self, cov, system):
+        return drawn(self.axis, self.weights, self.joint, cov, system, "dry friction")
 
 
 class FrictionDrift(JointEffect):

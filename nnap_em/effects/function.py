@@ -3,7 +3,7 @@
 import itertools
 import math
 from abc import abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import ClassVar
 
@@ -71,26 +71,7 @@ class Axis(AbstractAxis):
         return jnp.sum(jnp.stack([signals[name] for name in self.names]))
 
     def unit(self, system):
-        name = self.names[0]
-        return system.unit(name)
-
-
-class Direction(AbstractAxis):
-    """The way in which a joint moves, as dry friction opposes it: the only basis function rises where it turns."""
-
-    responds_to_feedback: ClassVar[bool] = False
-
-    def value(self, scene):
-        return scene.v[scene.system.rates.index(self.names[0])]
-
-    def unit(self, system):
         return system.unit(self.names[0])
-
-    def acts(self, system):
-        return system.rates.index(self.names[0]) + 1
-
-    def basis(self, value):
-        return jnp.tanh(value / self.high.astype(value.dtype))[None]
 
 
 class InputAxis(AbstractAxis):
@@ -125,7 +106,7 @@ class UnknownFunction(JointEffect):
 
     @classmethod
     def candidates(cls, around):
-        system, axes = around.system, _axes(around)
+        system, axes = around.system, axes_of(around)
         alone = [axes[name](20) for name in axes if name not in {(rate,) for rate in system.rates}]
         # an angle that goes round, where each turn is another place, as with a cable
         round_ = [axis.names for axis in alone if axis.turns and len(axis.names) == 1]
@@ -133,7 +114,6 @@ class UnknownFunction(JointEffect):
         states = [name for name in axes if set(name) <= {*system.coordinates, *system.rates}]
         pairs = (pair for pair in itertools.combinations(states, 2) if set(pair[0]).isdisjoint(pair[1]))
         grids = [(axis,) for axis in (*alone, *turns)] + [(axes[one](6), axes[other](6)) for one, other in pairs]
-        grids += _spots(around, axes)
         # states of a joint and of those next to it: what a force at it may be a function of
         pairs_of = dict(enumerate(zip(system.coordinates, system.rates, strict=True), 1))
         near = {j: {name for other in system.neighbours(j) for name in pairs_of[other]} for j in around.joints}
@@ -145,9 +125,6 @@ class UnknownFunction(JointEffect):
 
     def inputs_named(self):
         return tuple(dict.fromkeys(name for axis in self.axes for name in axis.names))
-
-    def inputs_free(self):
-        return tuple(dict.fromkeys(name for axis in self.axes if axis.count > 1 for name in axis.names))
 
     def signals(self, system):
         return tuple(dict.fromkeys(name for axis in self.axes for name in axis.signals(system)))
@@ -177,24 +154,24 @@ class UnknownFunction(JointEffect):
         return self.at(scene, self.torque([axis.value(scene) for axis in self.axes]))
 
     def curve(self, cov, system):
-        wide = [axis for axis in self.axes if axis.count > 1]
-        if len(wide) != 1:
-            return None
-        (axis,) = wide
-        x = np.linspace(float(axis.low), float(axis.high), 121)
-        against = 1 if len(self.axes) == 1 else -1  # dry friction is drawn as what it takes
-        basis = against * np.asarray(jax.vmap(axis.basis)(jnp.asarray(x)))
-        # its mean is that of the nodes, each weighted by how well it is known: what was never visited moves nothing
-        variance = np.einsum("xi,ij,xj->x", basis, cov, basis)
-        basis = basis - np.average(basis, axis=0, weights=1 / np.maximum(variance, 1e-12 * variance.max() + 1e-300))
-        std = np.sqrt(np.maximum(np.einsum("xi,ij,xj->x", basis, cov, basis), 0.0))
-        units, mean = (axis.unit(system), system.force_unit(self.joint)), basis @ np.asarray(self.weights)
-        return Curve(" + ".join(axis.names), units[0], self.joint, units[1], axis.turns, x, mean, std, basis)
+        return drawn(self.axes[0], self.weights, self.joint, cov, system) if len(self.axes) == 1 else None
+
+
+def drawn(axis: AbstractAxis, weights, joint: int, cov, system: AbstractSystem, of: str = "force") -> Curve:
+    """The function of one signal with these weights, of covariance `cov`."""
+    x = np.linspace(float(axis.low), float(axis.high), 121)
+    basis = np.asarray(jax.vmap(axis.basis)(jnp.asarray(x)))
+    # its mean is that of the nodes, each weighted by how well it is known: what was never visited moves nothing
+    variance = np.einsum("xi,ij,xj->x", basis, cov, basis)
+    basis = basis - np.average(basis, axis=0, weights=1 / np.maximum(variance, 1e-12 * variance.max() + 1e-300))
+    std = np.sqrt(np.maximum(np.einsum("xi,ij,xj->x", basis, cov, basis), 0.0))
+    units, mean = (axis.unit(system), system.force_unit(joint)), basis @ np.asarray(weights)
+    return Curve(" + ".join(axis.names), units[0], joint, units[1], axis.turns, x, mean, std, basis, of)
 
 
 def free_form(effect: AbstractEffect, around: SearchScales) -> list[Candidate]:
     """The unknown functions of the same signals at the same joint: what `effect` would be, were its form not known."""
-    axes = _axes(around)
+    axes = axes_of(around)
     inputs = {input_of(j): around.column(j) for j, _ in around.driven}
     names = [(inputs.get(name, name),) for name in effect.signals(around.system)]
     if effect.joint is None or not names or not all(name in axes for name in names):
@@ -210,14 +187,7 @@ def _function(joint: int, axes: tuple[AbstractAxis, ...], around: SearchScales) 
     return Candidate(make(np.zeros(number)), probes, make(np.full(number, 0.3 * size)))
 
 
-def _spots(around: SearchScales, axes: Mapping[tuple[str, ...], Callable]) -> list[tuple[AbstractAxis, ...]]:
-    """Dry friction at some angles: a function of a coordinate and of the direction in which it moves."""
-    names = zip(around.system.coordinates, around.system.rates, around.speed, strict=True)
-    knees = ((q, v, 0.02 * float(speed)) for q, v, speed in names if (q,) in axes)
-    return [(axes[q,](20), Direction((v,), -knee, knee, False, 1)) for q, v, knee in knees]
-
-
-def _axes(around: SearchScales) -> dict[tuple[str, ...], Callable[[int], AbstractAxis]]:
+def axes_of(around: SearchScales) -> dict[tuple[str, ...], Callable[[int], AbstractAxis]]:
     """Axes that a function may have, of any number of basis functions, by the names of what they read."""
     system = around.system
     ranges = {}

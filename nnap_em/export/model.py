@@ -57,7 +57,7 @@ def parameters(fitted: Identified) -> dict[str, Any]:
         ],
         "sensors": [{"name": name, "unit": unit} for name, unit in system.sensors.items()],
         "measured": list(rig.measured),
-        "dt": {"value": model.dt, "unit": "s"},
+        "dt": {"value": model.dt, "unit": rig.time_unit},
         "parameters": {
             n: {"value": v, "std": s, "unit": rig.unit(n), "estimated": n in estimated} for n, (v, s) in values.items()
         },

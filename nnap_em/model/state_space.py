@@ -91,7 +91,8 @@ class StateSpaceModel(AbstractModel):
         noise = zip((names[i] for i in self.measured), np.exp(0.5 * np.asarray(self.log_r)), strict=True)
         reads = ", ".join(f"{name} (noise {std:.2g} {self.system.unit(name)})" for name, std in noise)
         effects = [self._described(effect) for effect in self.effects]
-        return "\n  ".join([f"{self.system}, a row every {self.dt:g} s", f"reads: {reads}", *effects])
+        every = f"{self.system}, a row every {self.dt:g} {self.system.unit('time')}"
+        return "\n  ".join([every, f"reads: {reads}", *effects])
 
     def _described(self, effect: AbstractEffect) -> str:
         units, joint = effect.units_on(self.system), f" at joint {effect.joint}" if effect.joint else ""

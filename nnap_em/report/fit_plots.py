@@ -112,7 +112,7 @@ def effect_figure(curve: Curve) -> Figure:
     band(ax, curve.x, curve.mean, curve.std, AFTER, "learned")
     ax.axhline(0, color=ZERO_LINE, lw=0.7, zorder=0)
     signal = " + ".join(symbol(name) for name in curve.signal.split(" + "))
-    ax.set(xlabel=f"{signal} [{curve.signal_unit}]", ylabel=f"force at joint {curve.joint} [{curve.unit}]")
+    ax.set(xlabel=f"{signal} [{curve.signal_unit}]", ylabel=f"{curve.of} at joint {curve.joint} [{curve.unit}]")
     head(figure, "What was found", [ax])
     return figure
 

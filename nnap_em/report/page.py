@@ -181,8 +181,15 @@ def _unused(document: _Entry) -> list[Part]:
     if document.get("left_out"):
         out.append(f"Diverged, and left out of the last epoch: {', '.join(document['left_out'])}.")
     if masked := document.get("masked"):
+        unit = (document.get("units") or {}).get("time", "s")
         rows = [
-            [f"{e['part']}/{e['file']}", e["column"] or "all", e["kind"], str(e["amount"]), f"{number(e['time'], 4)} s"]
+            [
+                f"{e['part']}/{e['file']}",
+                e["column"] or "all",
+                e["kind"],
+                str(e["amount"]),
+                f"{number(e['time'], 4)} {unit}",
+            ]
             for e in masked
         ]
         text = (

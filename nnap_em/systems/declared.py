@@ -19,7 +19,7 @@ def declare(root: Table, of: Text | None = None) -> Declaration:
     units = model.table("units", absent={})
     units = {name: _unit(units, name) for name in units.items}
     states, inputs = _named(model, "states", own.states), _named(model, "inputs", own.inputs)
-    time = "s" if any((units | states | inputs).values()) else "time units"
+    bare = {} if any((units | states | inputs).values()) else {"time": "time units"}
     reserved = ("type", "inputs", "states", "rates", "unknown", "units", "exact", "open")
     parameters = {key: model.quantity(key) for key in model.items if key not in reserved}
     unknown = model.table("unknown", absent={})
@@ -44,7 +44,7 @@ def declare(root: Table, of: Text | None = None) -> Declaration:
         tuple(parameters),
         named,
         {name: (port, signals) for name, (port, signals) in terms.items() if port},
-        {"time": time, **own.units, **inherited, **units},
+        {**bare, **own.units, **inherited, **units},
         own.function,
         _exact(model, states, rates, parameters, (*named, *(port for port, _ in terms.values()))),
     )

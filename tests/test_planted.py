@@ -9,7 +9,7 @@ import planted_make
 import pytest
 from helpers import rate
 from planted_cases import CONTROLS, LAWS, PLANTED, REST, Motion, Plant, case_of
-from planted_table import score
+from planted_table import score, table
 
 from nnap_em.data.logs import check_split, read_logs
 from nnap_em.data.rig import read_rig
@@ -218,3 +218,19 @@ def test_the_log_ratio_is_1_where_the_effect_is_gone():
     for after, ratio, raised in ((0.1, 1.0, False), (0.2, 0.5, False), (0.4, 0.0, False), (0.41, -0.018, True)):
         judged = score(_record([SPRING_2], [SPRING], after=after), {"r": control})
         assert judged.ratio == pytest.approx(ratio, abs=1e-3) and judged.raised == judged.worse == raised
+
+
+def test_an_effect_is_visible_where_it_raises_an_error_at_some_horizon():
+    """To 0.4 rad at all of them: by 1.31 and 1.29 times at one, and by 4; a case without a control is not known."""
+    for recorded, row in (
+        ([0.4, 0.4, 0.4 / 1.31, 0.4], 1),
+        ([0.4, 0.4, 0.4 / 1.29, 0.4], 2),
+        ([0.1] * 4, 0),
+        (None, 2),
+    ):
+        control, case = _record([], []), _record([SPRING_2], [SPRING], after=0.1)
+        control["report"]["error"]["before"]["theta1"] = recorded
+        lines = table([case, *[control] * (recorded is not None)]).splitlines()
+        rows = [line for line in lines if line.startswith(("| error raised", "| 1.3 times", "| less"))]
+        assert len(rows) == (2 if row == 0 else 1) and ("less" in rows[0]) == (row == 2), rows
+        assert ("1 of 1 | 0 of 1 | 1 of 1 | 1 of 1" in rows[0]) == (recorded is not None), rows

@@ -457,7 +457,7 @@ class VaryingParameter(SignalEffect):
         return {"slope": f"1/({unit})" if unit else "-"}
 
     def phrase(self, sizes):
-        return f"a {self.channel} that changes with {self.reads[0]} ({sizes['slope']} from {float(self.middle):.3g} on)"
+        return f"a change of {self.channel} with {self.reads[0]} ({sizes['slope']} from {float(self.middle):.3g} on)"
 
     @classmethod
     def candidates(cls, around):

@@ -139,8 +139,8 @@ def sequences_of(data: Dataset | Logs, rig: Rig) -> Dataset:
     uneven = np.abs(steps - np.maximum(np.round(steps), 1)) > TOLERANCE
     if uneven.any() or np.median(steps) > 1 + TOLERANCE:
         i, k = np.argwhere(uneven if uneven.any() else steps > 1 + TOLERANCE)[0]
-        problem = f"sequence {i}, row {k + 1}: t goes from {t[i, k]:.6g} to {t[i, k + 1]:.6g} {rig.time_unit}"
-        raise DataError(f"{problem}, the rig has dt = {rig.dt:g}; resample to uniform rows, or correct dt")
+        problem = f"sequence {i}, row {k + 1}: t goes from {t[i, k]:.6g} to {t[i, k + 1]:.6g} {(unit := rig.time_unit)}"
+        raise DataError(f"{problem}, the rig has dt = {rig.dt:g} {unit}; resample to uniform rows, or correct dt")
     if (dark := valid & ~np.isfinite(u).all(axis=-1)).any():
         i, k = np.argwhere(dark)[0]
         raise DataError(f"sequence {i}, row {k}: u is no number; give it in every row (NaN in y is a missing reading)")
@@ -292,16 +292,12 @@ def _check_plausible(table: _Table, rig: Rig) -> None:
 
 def _rows(path: Path, t: Float[np.ndarray, " time"], rig: Rig) -> Int[np.ndarray, " time"]:
     """Place of the rows of a file in a uniform grid; refuses a clock that is not uniform but for a few gaps."""
-    steps = np.diff(t) / rig.dt
+    steps, unit = np.diff(t) / rig.dt, rig.time_unit
     typical = np.median(steps)
     if abs(typical - 1) > TOLERANCE and abs(steps.mean() - 1) > TOLERANCE:
         hint = other_unit(float(typical), "correct [sampling] dt of rig.toml, or resample with `nnap-em import`")
-        refuse(
-            path,
-            "column 'time'",
-            f"rows are {typical * rig.dt:.6g} {rig.time_unit} apart, rig.toml says {rig.dt:g}",
-            hint,
-        )
+        apart = f"rows are {typical * rig.dt:.6g} {unit} apart, rig.toml says {rig.dt:g} {unit}"
+        refuse(path, "column 'time'", apart, hint)
     intervals = np.maximum(np.round(steps), 1)
     wrong = np.abs(steps - intervals) > TOLERANCE
     missing = int(np.sum(intervals[~wrong] - 1))
@@ -310,12 +306,12 @@ def _rows(path: Path, t: Float[np.ndarray, " time"], rig: Rig) -> Int[np.ndarray
     if wrong.any():
         k, count = np.flatnonzero(wrong)[0], wrong.sum()
         kind = "time does not run on" if steps[k] <= 0 else "a gap" if steps[k] > 1.5 else "jitter"
-        problem = f"{kind}: {t[k]:.9g} {rig.time_unit}, then {t[k + 1]:.9g} ({counted(count, 'place')} in all)"
+        problem = f"{kind}: {t[k]:.9g} {unit}, then {t[k + 1]:.9g} {unit} ({counted(count, 'place')} in all)"
         hint = "resample to uniform rows with `nnap-em import`; a missing sample is an empty field of a row"
-        refuse(path, place(path, "time", int(k) + 1), problem, f"{hint} (dt = {rig.dt:g} {rig.time_unit})")
+        refuse(path, place(path, "time", int(k) + 1), problem, f"{hint} (dt = {rig.dt:g} {unit})")
     if rig.clock == "sequence" and abs(t[0]) > TOLERANCE * rig.dt:
         hint = 'subtract it, or declare [sampling] clock = "session" in rig.toml'
-        refuse(path, place(path, "time", 0), f"starts at {t[0]:.9g} {rig.time_unit}, not at 0", hint)
+        refuse(path, place(path, "time", 0), f"starts at {t[0]:.9g} {unit}, not at 0", hint)
     return np.append(0, np.cumsum(intervals)).astype(int)
 
 
@@ -340,7 +336,7 @@ def _whole(path: Path, table: Float[np.ndarray, "row column"], rows: Int[np.ndar
         if count:
             k = int(np.searchsorted(rows, first))  # the row of the file after the gap
             masked.append(Masked(path.name, kind, None, k + 1, float(full[first, 0]), count))
-            problem = f"a gap: {table[k - 1, 0]:.9g} {rig.time_unit}, then {table[k, 0]:.9g}"
+            problem = f"a gap: {table[k - 1, 0]:.9g} {rig.time_unit}, then {table[k, 0]:.9g} {rig.time_unit}"
             problem += f" ({counted(count, 'row')} {'missing' if kind == 'gap' else 'after it'} in all)"
             warnings.warn(f"{path}: {place(path, 'time', k)}: {problem}; {hint}", DataWarning, 2)
     return _Table(path, full[:end], used, masked)

@@ -855,7 +855,7 @@ a bump is a cogging
 # effects/friction.py
 ## test_inputs.py::test_what_is_not_seen_to_repeat_has_no_periods
 friction by angle need not repeat
-- return self.repeats(self.near, around)
+- return self.repeats(self.n, around)
 + return True
 ## test_inputs.py::test_dry_friction_at_an_angle_is_one_free_function_against_the_motion
 a form that is known has a price

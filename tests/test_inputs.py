@@ -122,12 +122,9 @@ def test_every_law_of_a_place_a_rate_or_an_input_has_a_free_form(plain):
 def test_what_is_not_seen_to_repeat_has_no_periods(plain):
     """The 2 rad where it mostly is hold more than one and a half of five periods a turn, and less of 4.5."""
     around = plain[-1]._replace(width=2 * np.ones(2), learned=True)
-    for law in ("cogging", "position_dependent_friction"):
-        seen = {
-            float(c.start.near): c.start.visible(around)
-            for c in catalogue[law].candidates(around)
-            if c.start.joint == 2
-        }
+    for law, periods in (("cogging", "near"), ("position_dependent_friction", "n")):
+        of = [c.start for c in catalogue[law].candidates(around) if c.start.joint == 2]
+        seen = {float(getattr(one, periods)): one.visible(around) for one in of}
         assert seen[5.0] and seen[max(seen)] and not any(seen[k] for k in seen if k < 4.6)
 
 
@@ -162,7 +159,7 @@ def test_dry_friction_at_an_angle_is_one_free_function_against_the_motion(plain)
         assert completed(named, with_effects(plain[0], (free,))) == ok
 
 
-FORMS_OF_FRICTION = {"position_dependent_friction": (0.1, 0.2, 3.0, 3.0), "eddy_brake": (0.1, 0.2)}
+FORMS_OF_FRICTION = {"position_dependent_friction": (0.1, 0.2, 3.0), "eddy_brake": (0.1, 0.2)}
 
 
 def test_a_spot_of_dry_friction_is_found_as_one(plain):
@@ -172,7 +169,9 @@ def test_a_spot_of_dry_friction_is_found_as_one(plain):
     weights = 0.3 * np.exp(-0.5 * ((centre - np.median(centre)) / 0.1) ** 2)
     law = dataclasses.replace(spot, weights=jnp.asarray(weights))
     drawn = law.curve(np.eye(20), plain[0].system)
-    assert drawn.of == "dry friction" and drawn.x[np.argmax(drawn.mean)] == pytest.approx(np.median(centre), abs=0.06)
+    assert drawn.of == "dry friction" and drawn.x[np.argmax(drawn.mean)] == pytest.approx(
+        np.median(centre), abs=np.ptp(drawn.x) / 60
+    )
     asked = _asked((law,))
     every = proposals(asked[-1]._replace(learned=True))
     rivals = [c for c in every if c.start.joint == 2 and len(c.start.signals(plain[0].system)) == 2]
@@ -187,8 +186,9 @@ def test_a_joint_is_seen_where_it_moves(plain):
     mean = np.asarray(path.mean).copy()
     mean[..., 1] = np.append(np.zeros(rest), np.linspace(-1.0, 1.0, ROWS - rest))
     mean[..., 3] = np.append(np.zeros(rest), np.full(ROWS - rest, 3.0))
-    seen = surroundings(RIG, model, data, path._replace(mean=jnp.asarray(mean)), ROWS).width[1]
-    assert seen == pytest.approx(0.9 * 2.0, rel=0.05)
+    mean[..., 0] = mean[..., 2] = 0.0  # the other never moves
+    still, seen = surroundings(RIG, model, data, path._replace(mean=jnp.asarray(mean)), ROWS).width
+    assert still == 0.0 and seen == pytest.approx(0.9 * 2.0, abs=2.0 / 19)  # it moves through 20 places
 
 
 def test_a_spring_is_straight_beyond_what_was_seen():

@@ -139,8 +139,10 @@ def sequences_of(data: Dataset | Logs, rig: Rig) -> Dataset:
     uneven = np.abs(steps - np.maximum(np.round(steps), 1)) > TOLERANCE
     if uneven.any() or np.median(steps) > 1 + TOLERANCE:
         i, k = np.argwhere(uneven if uneven.any() else steps > 1 + TOLERANCE)[0]
-        problem = f"sequence {i}, row {k + 1}: t goes from {t[i, k]:.6g} to {t[i, k + 1]:.6g} {(unit := rig.time_unit)}"
-        raise DataError(f"{problem}, the rig has dt = {rig.dt:g} {unit}; resample to uniform rows, or correct dt")
+        problem = f"sequence {i}, row {k + 1}: t goes from {t[i, k]:.6g} to {t[i, k + 1]:.6g} {rig.time_unit}"
+        raise DataError(
+            f"{problem}, the rig has dt = {rig.dt:g} {rig.time_unit}; resample to uniform rows, or correct dt"
+        )
     if (dark := valid & ~np.isfinite(u).all(axis=-1)).any():
         i, k = np.argwhere(dark)[0]
         raise DataError(f"sequence {i}, row {k}: u is no number; give it in every row (NaN in y is a missing reading)")

@@ -119,8 +119,9 @@ def verdict(
     """
     if unfinished:
         known = accepted or rivals or suspects
-        said: dict[str, Any] = {"misfit": misfit, "tried": tried}
-        first = verdict(accepted, error, failed, rivals, suspects, **said) if known else "No effect was found yet."
+        first = "No effect was found yet."
+        if known:
+            first = verdict(accepted, error, failed, rivals, suspects, misfit=misfit, tried=tried)
         return f"{first} {unfinished}: more may be missing."
     if not accepted and rivals:
         same = f"{listed([*map(words, rivals)])} explain the same; none is added."
@@ -128,11 +129,8 @@ def verdict(
     if not accepted and suspects:
         first, *remaining = suspects
         others = f" ({len(remaining)} more below)" if remaining else ""
-        none = (
-            f"{misfit} None of {tried} laws tried explains it for certain."
-            if misfit
-            else "No effect is certain to be missing."
-        )
+        explains = f"{misfit} None of {tried} laws tried explains it for certain."
+        none = explains if misfit else "No effect is certain to be missing."
         return f"{none} Suspected: {first['description']}{others}."
     if not accepted and misfit and tried:
         return f"{misfit} None of {tried} laws tried explains it."

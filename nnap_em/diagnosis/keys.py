@@ -52,7 +52,7 @@ def listed(names: Sequence[str]) -> str:
 def remainder_of(effect: AbstractEffect, model: StateSpaceModel) -> int | None:
     """Place of the named law whose rest an unnamed one is: a function of the same signals at the same joint."""
     laws = (i for i, e in enumerate(model.effects) if e.named and contains(effect, e, model.system))
-    return None if effect.named else next(laws, None)
+    return next(laws, None)
 
 
 def replaced(effect: AbstractEffect, model: StateSpaceModel) -> int | None:

@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 from ..data.dataset import Dataset
 from ..data.rig import Rig
 from ..effects import AbstractEffect, Candidate, SearchScales, catalogue, flat, free_form
+from ..effects.base import KNEE
 from ..em.build import measure_scales
 from ..model.state_space import StateSpaceModel, with_effects
 from ..numerics.gaussian import Gaussian
@@ -32,12 +33,12 @@ def surroundings(
     low, high = np.percentile(mean[:, :dof], [0.5, 99.5], axis=0)
     drive = np.nan_to_num(np.asarray(each(_drives, with_effects(model, ()), (path.mean, data))))
     drive = np.max(np.abs(np.where(valid[..., None], drive, 0.0)), axis=(0, 1), initial=0.0)
-    speed = np.percentile(np.abs(mean[:, dof : 2 * dof]), 99.5, axis=0) + 1e-9
-    moving = np.where(np.abs(mean[:, dof : 2 * dof]) > 0.02 * speed, mean[:, :dof], np.nan)
+    fast = np.percentile(rate := np.abs(mean[:, dof : 2 * dof]), 99.5, axis=0)
+    moving, speed = np.where(rate >= KNEE * fast, mean[:, :dof], np.nan), fast + 1e-9
     ends = jnp.asarray(np.outer([1.0, 0.4, -0.4, -1.0], speed))
-    fast, slow, back, fast_back = np.asarray(_torques(model.unknown, ends))
+    ahead, slow, back, fast_back = np.asarray(_torques(model.unknown, ends))
     # what rises between 0.4 and 1 of the top speed, on both sides, is not dry friction any more: the viscous slope
-    viscous = np.maximum(0.0, -((fast - fast_back) - (slow - back)) / (1.2 * speed))
+    viscous = np.maximum(0.0, -((ahead - fast_back) - (slow - back)) / (1.2 * speed))
     ending = float(clock.max()) + rig.dt * (rows - int(valid.sum(axis=1).max()))
     return SearchScales(
         model.system, scales.torque, speed, viscous, low, high, drive[[joint - 1 for joint in model.system.joints]],

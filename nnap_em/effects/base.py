@@ -36,6 +36,11 @@ class OperatingPoint(NamedTuple):
     """Inputs that reach the plant."""
 
 
+KNEE = 0.02
+"""Share of the largest velocity of a joint within which it turns round: the sign of dry friction is smoothed over it,
+and below it a joint rests."""
+
+
 class SearchScales(NamedTuple):
     """Sizes that candidates are built from, all read off the logs and the declared physics."""
 
@@ -144,7 +149,7 @@ class Curve(NamedTuple):
     basis: Float[np.ndarray, "node basis"] | None = None
     """Functions whose sum the curve is; None: the values as they stand."""
     of: str = "force"
-    """What it is: a force, or friction that it takes."""
+    """Quantity that `mean` holds: a force, or the dry friction against the motion."""
 
 
 class Stream(NamedTuple):

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .base import AbstractEffect, Candidate, JointEffect, Scalar, a, fields, input_of, known, one, pair
+from .base import KNEE, AbstractEffect, Candidate, JointEffect, Scalar, a, fields, input_of, known, one, pair
 from .function import Axis, axes_of, drawn
 
 
@@ -27,24 +27,18 @@ class PositionDependentFriction(JointEffect):
     cosine: Scalar
     sine: Scalar
     n: Scalar
-    near: Scalar = known(default=1.0)
-    """Value of n at which it was found; far from it the law is a different one."""
 
     @classmethod
     def candidates(cls, around):
         turning = around.turning if around.learned else []
-        make = lambda n, j: lambda c, s, m: cls.of(c, s, m, n, joint=j)  # noqa: E731
-        return [pair(make(n, j), 0.1, 1.0, (n, 0.3)) for j in turning for n in np.arange(1.0, 7.0)]
+        return [pair(partial(cls.of, joint=j), 0.1, 1.0, (n, 0.3)) for j in turning for n in np.arange(1.0, 7.0)]
 
     def values(self):
         depth = jnp.sqrt(self.sine**2 + self.cosine**2 + 1e-30)
         return {"depth": depth, "n": self.n, "phase": jnp.arctan2(-self.sine, self.cosine)}
 
-    def is_physical(self):
-        return abs(float(self.n) - float(self.near)) < 0.5  # half of the way to the next start
-
     def visible(self, around):
-        return self.repeats(self.near, around)
+        return self.repeats(self.n, around)
 
     def friction(self, torque, scene):
         angle = self.n * self.own(scene.q)
@@ -76,8 +70,7 @@ class DryFriction(JointEffect):
             if not around.learned or (name,) not in places:
                 continue
             axis, size = places[name,](20), float(around.torque[j - 1])
-            knee = 0.02 * float(around.speed[j - 1])  # as of a friction that grows with torque
-            make = partial(cls, axis=axis, knee=knee, rate=rate, joint=j)
+            make = partial(cls, axis=axis, knee=KNEE * float(around.speed[j - 1]), rate=rate, joint=j)
             probes = tuple(make(jnp.asarray(0.05 * size * row)) for row in np.eye(axis.count))
             out.append(Candidate(make(jnp.zeros(axis.count)), probes, make(jnp.full(axis.count, 0.3 * size))))
         return out
@@ -166,7 +159,7 @@ class LoadFriction(JointEffect):
     def candidates(cls, around):
         def make(j: int, whole: bool):
             names = around.column(j), around.system.rates[j - 1]
-            return partial(cls, knee=a(0.02 * float(around.speed[j - 1])), whole=whole, names=names, joint=j)
+            return partial(cls, knee=a(KNEE * float(around.speed[j - 1])), whole=whole, names=names, joint=j)
 
         return [one(make(j, whole), 0.0, 0.05, 0.5) for j, _ in around.driven for whole in (False, True)]
 
@@ -323,7 +316,7 @@ class PreslidingFriction(JointEffect):
         out = []
         for j in around.joints:
             size, speed, b = (float(values[j - 1]) for values in (around.torque, around.speed, around.viscous))
-            fixed = (0.02 * speed, size, 2.0 / around.dt)
+            fixed = (KNEE * speed, size, 2.0 / around.dt)
             for s in (0.5, 2.0, 8.0, 32.0):
                 inner = 0.4 * np.sqrt(s * size * around.inertia(j))  # a fifth of critical
                 stiff, soft = (cls.of(np.log(k * size), inner, b, *fixed, joint=j) for k in (1e4, s))

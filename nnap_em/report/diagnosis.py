@@ -66,10 +66,8 @@ def write_diagnosis(
     ]
     rivals, suspects = undecided(diagnosis), suspected(diagnosis)
     failed = sum(t.p_value < 0.01 and not t.slight for t in tested["before"])
-    after, tried = (
-        diagnosis.after,
-        len({key for step in diagnosis.steps for key, _ in (*step.screened, *step.refitted)}),
-    )
+    after = diagnosis.after
+    tried = len({key for step in diagnosis.steps for key, _ in (*step.screened, *step.refitted)})
     far, misfit = moved(after.rig, after.m_step.prior, after.model), after.misfit
     outcome = verdict(accepted, error, failed, rivals, suspects, diagnosis.unfinished, misfit=misfit.text, tried=tried)
     if diagnosis.change:

@@ -182,15 +182,10 @@ def _unused(document: _Entry) -> list[Part]:
         out.append(f"Diverged, and left out of the last epoch: {', '.join(document['left_out'])}.")
     if masked := document.get("masked"):
         unit = (document.get("units") or {}).get("time", "s")
+        first = [f"{number(e['time'], 4)} {unit}" for e in masked]
         rows = [
-            [
-                f"{e['part']}/{e['file']}",
-                e["column"] or "all",
-                e["kind"],
-                str(e["amount"]),
-                f"{number(e['time'], 4)} {unit}",
-            ]
-            for e in masked
+            [f"{e['part']}/{e['file']}", e["column"] or "all", e["kind"], str(e["amount"]), at]
+            for e, at in zip(masked, first, strict=True)
         ]
         text = (
             "These readings were taken as missing: they are far from what the rows around them say, or their sensor "

@@ -773,6 +773,10 @@ a column of the nuisance is a candidate
 - return self.survived >= SURVIVES and
 + return
 # diagnosis/context.py
+## test_search.py::test_a_search_begins_at_the_whole_length_unless_most_sequences_are_lost_there
+a search with a hidden joint begins where friction has taken the law
+- [*growing[-1:], longest]
++ [longest]
 ## test_search.py::test_the_fit_of_the_least_error_is_kept_the_likelier_of_near_ones_and_none_that_predicts_worse
 a fit that predicts worse is kept
 - if min(left) > 1:
@@ -789,6 +793,10 @@ the fit that is behind wins
 a free function is a change whatever the errors
 - law.named or context.functions
 + True
+## test_search.py::test_a_round[a refit removes less]
+the first law that a refit leaves is accepted
+- removed > EXCEEDS * max(
++ removed > 0 * max(
 ## test_search.py::test_a_round[even after the refit too]
 the weakest of even laws leads
 - simplest(worths, _complexities(admissible, model), values)

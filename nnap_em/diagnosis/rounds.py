@@ -24,7 +24,7 @@ from .screen import Screened, screen
 from .search import Round
 from .smoothed import SmoothedFit, extended
 from .trial import Trial, null_of, with_candidate
-from .verdict import EQUIVALENT, NAMED, SURVIVES, even, odds, simplest, suspected
+from .verdict import EQUIVALENT, EXCEEDS, NAMED, SURVIVES, even, odds, simplest, suspected
 
 _Law = TypeVar("_Law", Screened, Trial)
 SHORTLIST = 8
@@ -92,8 +92,9 @@ def decided(
     model: StateSpaceModel,
     context: SearchContext,
 ) -> tuple[Step, tuple[Trial, tuple[Key, ...]] | None, bool]:
-    """The best laws of a screen, `refitted` from their starts that explain as much, until one is accepted: the round,
-    that law with those that the data cannot distinguish from it, and False where the time was up before.
+    """The best laws of a screen, `refitted` from their starts that explain as much, until none that is left at the same
+    band may be worth more than the best of them: a refit removes less than a linear screen saw, or more. The round, the
+    law that is accepted with those that the data cannot distinguish from it, and False where the time was up before.
     """
     ranked = best_of_kind(s for s in fresh if seeded(s.candidate, s.coefficients).is_physical())
     step = step._replace(screened=tuple((key_of(s.candidate.start), s.listed) for s in ranked))
@@ -101,15 +102,18 @@ def decided(
     tried: list[Trial] = []
     complete = True
     try:
-        while admitted and (left := SHORTLIST - len(tried)) > 0:
-            group = _group(admitted, model)[:left]
-            cases = [refitted(_forms(s, fresh)) for s in group]
-            tried += cases
-            if admissible := [case for case in cases if case.rejection is None]:
-                return *_accepted(admissible, step._replace(refitted=_removals(tried)), model, context), True
+        while admitted and (room := SHORTLIST - len(tried)) > 0:
+            group = _group(admitted, model)[:room]
+            tried += [refitted(_forms(s, fresh)) for s in group]
             admitted = [s for s in admitted if not any(s is other for other in group)]
+            possible, left = [case for case in tried if case.rejection is None], _band(admitted, group[0].band)
+            removed = max(_worths(possible, [case.removed for case in possible], model), default=0.0)
+            if removed > EXCEEDS * max(_worths(left, [s.share.least for s in left], model), default=0.0):
+                break
     except TimeUp:
         complete = False
+    if admissible := [case for case in tried if case.rejection is None]:
+        return *_accepted(admissible, step._replace(refitted=_removals(tried)), model, context), complete
     judged = {key_of(case.candidate.start) for case in tried}
     suspects = _suspects([s for s in ranked if key_of(s.candidate.start) not in judged])
     return step._replace(refitted=_removals(tried), suspects=suspects, untried=len(admitted)), None, complete
@@ -120,7 +124,7 @@ def _group(admitted: Sequence[Screened], model: StateSpaceModel) -> list[Screene
     that a free function contains, or the reverse, comes in the form that explains as much as the better one, and as
     itself where that is the function: a refit may show that it explains as much.
     """
-    band = [s for s in admitted if s.band == min(s.band for s in admitted)]
+    band = _band(admitted, min(s.band for s in admitted))
     values = [s.ratio for s in band]
     worths = _worths(band, values, model)
     group: list[Screened] = []
@@ -129,6 +133,10 @@ def _group(admitted: Sequence[Screened], model: StateSpaceModel) -> list[Screene
         group += [form, band[i]] if complexity(form.candidate.start) > complexity(band[i].candidate.start) else [form]
     group += [s for law in group for s in admitted if elsewhere(key_of(s.candidate.start), key_of(law.candidate.start))]
     return list({id(s): s for s in group}.values())
+
+
+def _band(laws: Sequence[Screened], band: int) -> list[Screened]:
+    return [s for s in laws if s.band == band]
 
 
 def _accepted(

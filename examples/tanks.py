@@ -29,7 +29,7 @@ from matplotlib.figure import Figure
 from nnap_em import load, predict, read_logs
 from nnap_em.commands.cli import main as nnap_em
 from nnap_em.commands.common import set_up
-from nnap_em.data.logs import DataWarning
+from nnap_em.errors import DataWarning
 from nnap_em.report.style import AFTER, BEFORE, READING, head, styled
 
 RIG = Path(__file__).resolve().parent / "machines" / "tanks.toml"

@@ -10,7 +10,6 @@ import pytest
 from rigs import slide_logs, slide_rig
 
 from nnap_em import diagnose, findings, identify
-from nnap_em.data.dataset import DataError
 from nnap_em.data.rig import Declared
 from nnap_em.diagnosis.findings import changes
 from nnap_em.diagnosis.outcome import Diagnosis
@@ -18,6 +17,7 @@ from nnap_em.diagnosis.verdict import KEEP, RISEN, veto
 from nnap_em.effects.position import TorsionalSpring
 from nnap_em.em.multistep import Linear
 from nnap_em.em.recorded import Risen, level, risen
+from nnap_em.errors import DataError
 from nnap_em.fit.identify import begin
 from nnap_em.fit.known import differences, known
 from nnap_em.fit.store import load, save

@@ -12,8 +12,9 @@ from helpers import slide as slide_model
 
 from nnap_em.data.dataset import Dataset
 from nnap_em.data.logs import REPEAT, Logs, Masked
-from nnap_em.data.rig import Declared, Rig, RigError, read_rig
+from nnap_em.data.rig import Declared, Rig, read_rig
 from nnap_em.em.build import build_system, measure_scales
+from nnap_em.errors import RigError
 from nnap_em.fit.check import Along, CheckResult, check, gramian, torques, undetermined
 from nnap_em.fit.check import _motion as motion
 from nnap_em.fit.check import _observability as observability

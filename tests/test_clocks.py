@@ -11,7 +11,7 @@ from helpers import pendulum_rig, read_table
 from recorders import EPOCH, JOINTS, MULTI, NS, TOPICS, arrays, imported, joint_states, ns, ros2, write_hdf5, write_mcap
 
 from nnap_em.data import dates
-from nnap_em.data.dataset import DataError
+from nnap_em.errors import DataError
 from nnap_em.import_ import clock
 from nnap_em.import_.resample import Resampled
 from nnap_em.import_.signals import Signal, sent_on_change

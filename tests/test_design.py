@@ -14,12 +14,12 @@ from rigs import slide_logs, slide_rig
 import nnap_em
 from nnap_em.data.dataset import Dataset
 from nnap_em.data.limits import Bounds
-from nnap_em.data.rig import Rig, RigError, read_rig, write_rig
-from nnap_em.errors import StoreError
+from nnap_em.data.rig import Rig, read_rig, write_rig
+from nnap_em.errors import DesignError, RigError, StoreError
 from nnap_em.experiment.criteria import Criterion, after, share
 from nnap_em.experiment.experiment import design
 from nnap_em.experiment.information import Fit, information, known
-from nnap_em.experiment.limits import DesignError, Limits, limits_of
+from nnap_em.experiment.limits import Limits, limits_of
 from nnap_em.experiment.play import Motions, allowed, motions
 from nnap_em.experiment.search import Effort
 from nnap_em.experiment.signals import FAMILIES, drawn, mutated, played

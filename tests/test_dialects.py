@@ -17,9 +17,9 @@ from helpers import pendulum_rig
 from recorders import imported, ns, plain_json, write_hdf5, write_mcap
 
 from nnap_em.data import formats
-from nnap_em.data.dataset import DataError
-from nnap_em.data.logs import DataWarning, read_logs
+from nnap_em.data.logs import read_logs
 from nnap_em.data.rig import read_rig
+from nnap_em.errors import DataError, DataWarning
 from nnap_em.import_ import text_file
 from nnap_em.import_.columns import in_unit
 from nnap_em.import_.recording import Address, Topic, last_word, places

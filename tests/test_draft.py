@@ -9,10 +9,10 @@ import pytest
 from recorders import Q, robot_log
 
 from nnap_em.commands import cli
-from nnap_em.data.dataset import DataError
 from nnap_em.data.formats import write_csv
 from nnap_em.data.logs import read_logs
-from nnap_em.data.rig import RigError, read_rig
+from nnap_em.data.rig import read_rig
+from nnap_em.errors import DataError, RigError
 from nnap_em.init.draft import common_step, draft
 from nnap_em.init.equations import draft_equations
 from nnap_em.init.from_machine import draft_machine

@@ -6,8 +6,9 @@ from helpers import swing, swing_rig
 
 from nnap_em.data.formats import write_csv
 from nnap_em.data.held import HELD_ROWS, hold, repeats
-from nnap_em.data.logs import DataWarning, read_logs
+from nnap_em.data.logs import read_logs
 from nnap_em.data.rough import rough
+from nnap_em.errors import DataWarning
 
 T = 0.01 * np.arange(601)
 ANGLE = np.sin(2.2 * T) + 0.3 * np.sin(9.1 * T + 0.4)

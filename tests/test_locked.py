@@ -13,12 +13,12 @@ from helpers import file_rig, written_again
 from machines import arm
 
 from nnap_em.data.dataset import Dataset
-from nnap_em.data.rig import RigError, read_rig
+from nnap_em.data.rig import read_rig
 from nnap_em.em.build import build_system
+from nnap_em.errors import MachineError, RigError
 from nnap_em.export.mjcf import write_mjcf
 from nnap_em.fit.identify import begin
 from nnap_em.machines.mjcf import Part, read_machine
-from nnap_em.machines.spec import MachineError
 from nnap_em.systems import specs
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -14,9 +14,10 @@ from helpers import file_rig, written_again
 from machines import arm, tree
 
 from nnap_em.data.machine import packed, unpacked
-from nnap_em.data.rig import Declared, RigError, RigWarning, read_rig
+from nnap_em.data.rig import Declared, read_rig
 from nnap_em.effects import catalogue
 from nnap_em.em.build import build_system
+from nnap_em.errors import RigError, RigWarning
 from nnap_em.fit.identifiability import identifiability
 from nnap_em.init.from_machine import draft_machine
 from nnap_em.machines.mjcf import read_machine

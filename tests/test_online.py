@@ -13,7 +13,7 @@ from nnap_em.commands import cli
 from nnap_em.data.dataset import Dataset
 from nnap_em.data.rig import Declared, Rig
 from nnap_em.effects import catalogue
-from nnap_em.export.model import ExportError
+from nnap_em.errors import ExportError
 from nnap_em.export.online import write_observer
 from nnap_em.fit.identify import begin
 from nnap_em.fit.observer import AMBIGUOUS, MISSING, OUTLIER, observer

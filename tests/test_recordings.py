@@ -27,7 +27,7 @@ from recorders import (
 from rosbags import rosbag1, rosbag2
 from rosbags.typesys import Stores, get_typestore
 
-from nnap_em.data.dataset import DataError
+from nnap_em.errors import DataError
 from nnap_em.import_.files import reader
 
 T = 0.01 * np.arange(300)

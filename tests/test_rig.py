@@ -9,9 +9,10 @@ import pytest
 
 from nnap_em.commands import cli
 from nnap_em.data.limits import Bounds
-from nnap_em.data.rig import Declared, Rig, RigError, SystemSpec, read_rig, write_rig
+from nnap_em.data.rig import Declared, Rig, SystemSpec, read_rig, write_rig
 from nnap_em.data.table import flat
 from nnap_em.data.units import parameter_unit
+from nnap_em.errors import RigError
 from nnap_em.systems import specs
 
 STATES = ("theta1", "theta2", "dtheta1", "dtheta2")

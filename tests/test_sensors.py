@@ -15,12 +15,13 @@ from helpers import csv_text, file_rig, written_again
 from machines import arm
 
 from nnap_em.data.dataset import Dataset
-from nnap_em.data.rig import RigError, read_rig
+from nnap_em.data.rig import read_rig
 from nnap_em.effects.sensor import SensorBias
 from nnap_em.em.build import build_system
 from nnap_em.em.mstep import _noise_floor
 from nnap_em.em.prior import ParameterPrior
 from nnap_em.em.quadratic import local, quadratic, readings_at
+from nnap_em.errors import RigError
 from nnap_em.export.model import parameters
 from nnap_em.fit.identify import begin
 from nnap_em.fit.store import load, save

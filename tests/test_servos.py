@@ -11,13 +11,14 @@ import pytest
 from helpers import PENDULUM, rig_text, servo_model, written_again
 
 from nnap_em.data.dataset import Dataset
-from nnap_em.data.logs import DataError, read_logs
-from nnap_em.data.rig import Declared, Rig, RigError, read_rig
+from nnap_em.data.logs import read_logs
+from nnap_em.data.rig import Declared, Rig, read_rig
 from nnap_em.data.servo import KINDS
 from nnap_em.effects.actuator import InputDelay
 from nnap_em.em.build import build, build_system
 from nnap_em.em.servos import build_servos
-from nnap_em.export.model import ExportError, write_model
+from nnap_em.errors import DataError, ExportError, RigError
+from nnap_em.export.model import write_model
 from nnap_em.fit.identifiability import identifiability, sentences
 from nnap_em.fit.identify import begin
 from nnap_em.fit.store import load, save

@@ -11,8 +11,8 @@ import pytest
 from helpers import around, declared_model
 
 from nnap_em.effects import catalogue
+from nnap_em.errors import ExportError
 from nnap_em.export.c99 import WHOLE, Dialect, function
-from nnap_em.export.model import ExportError
 from nnap_em.export.unroll import unroll
 from nnap_em.model.friction import FrictionNetwork
 from nnap_em.model.state_space import Inputs, with_effects

@@ -22,9 +22,10 @@ from nnap_em.effects.actuator import ActuatorLag, Saturation
 from nnap_em.effects.body import Payload
 from nnap_em.effects.friction import BackEmf
 from nnap_em.effects.position import Cogging, TorsionalSpring
+from nnap_em.errors import ExportError
 from nnap_em.export.friction import FrictionForm, friction_form
 from nnap_em.export.mjcf import as_it_is, write_mjcf
-from nnap_em.export.model import ExportError, write_model
+from nnap_em.export.model import write_model
 from nnap_em.export.urdf import write_urdf
 from nnap_em.fit.identify import Identified, begin
 from nnap_em.fit.store import load, save

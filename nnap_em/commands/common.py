@@ -16,12 +16,13 @@ import jax
 import numpy as np
 
 from .. import errors
-from ..data.dataset import DataError, Dataset
+from ..data.dataset import Dataset
 from ..data.formats import has_logs, header, write_csv
-from ..data.logs import DataWarning, Logs, check_split, read_logs, together
-from ..data.rig import Rig, RigError, read_rig
+from ..data.logs import Logs, check_split, read_logs, together
+from ..data.rig import Rig, read_rig
 from ..em.build import build_system, measure_scales
 from ..em.equations import infinite_rates
+from ..errors import DataError, DataWarning, RigError
 from ..fit.check import ERROR, WARNING, rates, torques
 from ..fit.identify import Identified
 from ..fit.known import differences

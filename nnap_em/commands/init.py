@@ -15,7 +15,7 @@ rig.toml that is there is never overwritten.
 import argparse
 from pathlib import Path
 
-from ..data.dataset import DataError
+from ..errors import DataError
 from ..import_.text_file import plain_csv
 from ..init.draft import draft
 from ..init.equations import draft_equations

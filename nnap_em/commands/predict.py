@@ -15,8 +15,9 @@ import warnings
 import jax
 import numpy as np
 
-from ..data.logs import DataWarning, read_logs
+from ..data.logs import read_logs
 from ..diagnosis.keys import listed
+from ..errors import DataWarning
 from ..fit.predict import given_samples, predict
 from ..fit.store import load, model_file
 from ..numerics.digits import counted

@@ -16,9 +16,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..data.dataset import DataError
 from ..data.formats import write_csv
 from ..data.rig import Rig, nearest, write_rig
+from ..errors import DataError
 from ..model.simulate import Experiment, declared, examples, sensed, sweep_experiment
 from ..model.state_space import StateSpaceModel
 from ..numerics.digits import counted

@@ -15,6 +15,7 @@ from ..diagnosis.findings import Estimate, estimates
 from ..diagnosis.hypothesis import covariances
 from ..diagnosis.keys import key_of, listed, words
 from ..diagnosis.statistics import holm
+from ..errors import CompareError
 from ..fit.identify import Identified, friction_table, nodes_between, parameter_table
 from ..fit.store import load, model_file
 from ..model.friction import FrictionNetwork
@@ -27,10 +28,6 @@ CHANGED = 0.01
 
 A hundred comparisons of machines that did not change give one false alarm, whatever the number of quantities; a change
 by five of its standard deviations still counts among ten thousand quantities."""
-
-
-class CompareError(ValueError):
-    """Fits that cannot be compared: the message names them and the reason, with a hint."""
 
 
 class Quantity(NamedTuple):

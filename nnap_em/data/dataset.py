@@ -8,13 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from ..errors import DataError
 from ..numerics.digits import counted
 
 Array = jax.Array | np.ndarray  # host or device
-
-
-class DataError(ValueError):
-    """A mistake in a log: the message names the file, the place, the value and a hint."""
 
 
 class Dataset(NamedTuple):

@@ -17,9 +17,10 @@ import numpy as np
 import scipy.io
 from jaxtyping import Float, Real
 
+from ..errors import DataError
 from ..numerics.digits import counted
 from ..storage.files import replace_text
-from .dataset import Array, DataError
+from .dataset import Array
 from .dates import dated, moments
 from .mat_structs import mat_columns
 from .rig import nearest

@@ -10,8 +10,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
+from ..errors import DataError, DataWarning
 from ..numerics.digits import counted
-from .dataset import DataError, Dataset, pad
+from .dataset import Dataset, pad
 from .formats import columns_of, header_hint, log_files, place, refuse, table_of, untimed
 from .held import hold
 from .held import repeats as held_rows
@@ -33,10 +34,6 @@ _REASONS = {
     "late start": "one value over again until the sensor starts",
     "saturated": "at the end of the sensor's range while the machine goes beyond",
 }
-
-
-class DataWarning(UserWarning):
-    """Something in a log that is possible but seldom meant."""
 
 
 class Masked(NamedTuple):

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from .dataset import DataError
+from ..errors import DataError
 
 
 def mat_columns(path: Path, variables: Mapping[str, np.ndarray]) -> Iterator[tuple[str, Any]]:

@@ -11,11 +11,12 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from ..errors import RigError, RigWarning
 from ..storage.files import replace_text
 from .limits import UNBOUNDED, Bounds, read_bounds, read_range
 from .machine import machine_unit, unpacked
 from .servo import AT, TORQUE, Inputs, key_of, read_inputs
-from .table import HOLD, SMOOTH, Declared, RigError, RigWarning, Table, every, nearest, toml_text, whole_table, written
+from .table import HOLD, SMOOTH, Declared, Table, every, nearest, toml_text, whole_table, written
 from .units import UNITS, factor, named_unit, parameter_unit, quantities, with_names
 
 

@@ -12,6 +12,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NoReturn
 
+from ..errors import RigError
+
 HOLD, SMOOTH = "zero-order", "first-order"
 """Holds of inputs: commands stay until the next row; measured signals go on from row to row."""
 _LINES = {  # of keys, then of tables: how they should look
@@ -37,14 +39,6 @@ _LINES = {  # of keys, then of tables: how they should look
     "limits": "a table [limits] with lines such as u = 0.3 or theta1 = [-2.0, 2.0]",
     "rate": "a table [limits.rate] with lines such as u = 5.0 (N m/s)",
 }
-
-
-class RigError(ValueError):
-    """A mistake in rig.toml: the message names the file, the table and key, what was found and the remedy."""
-
-
-class RigWarning(UserWarning):
-    """Something in rig.toml that is possible but seldom meant."""
 
 
 @dataclass(frozen=True)

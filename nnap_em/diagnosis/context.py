@@ -12,10 +12,11 @@ from jaxtyping import Bool, Float
 from ..data.dataset import Dataset, horizon
 from ..effects import Candidate
 from ..effects.sensor import SensorQuantization, grid_step
-from ..em.loop import SCHEDULE, EMState, FitError, Schedule, e_step, fit, later_state, start_state
+from ..em.loop import SCHEDULE, EMState, Schedule, e_step, fit, later_state, start_state
 from ..em.mstep import ScoringMStep, not_diverged
 from ..em.multistep import JUDGED, LEAST_FALL, errors, followed, ratio
 from ..em.recorded import Risen
+from ..errors import FitError
 from ..fit.identify import Identified, begin
 from ..model.state_space import StateSpaceModel
 from ..numerics.digits import counted

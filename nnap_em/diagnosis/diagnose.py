@@ -14,9 +14,10 @@ from jaxtyping import Bool, PRNGKeyArray
 from ..data.dataset import Dataset, stepped
 from ..data.logs import Logs, sequences_of
 from ..data.rig import Rig
-from ..em.loop import EMState, FitError, e_step
+from ..em.loop import EMState, e_step
 from ..em.mstep import ScoringMStep, not_diverged
 from ..em.readings import white_readings
+from ..errors import FitError
 from ..fit.identify import Identified, begin, finished, identify
 from ..fit.known import forgotten, known, unheld
 from ..model.state_space import StateSpaceModel

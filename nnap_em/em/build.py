@@ -10,7 +10,8 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from ..data.dataset import Dataset
-from ..data.rig import SMOOTH, Rig, RigError
+from ..data.rig import SMOOTH, Rig
+from ..errors import RigError
 from ..model.friction import FrictionNetwork, NoFriction
 from ..model.state_space import MOST_STEPS, SUBSTEPS, StateSpaceModel
 from ..numerics.gaussian import Gaussian

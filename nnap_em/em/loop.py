@@ -17,6 +17,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from ..data.dataset import Dataset, horizon
+from ..errors import FitError
 from ..model.base import AbstractModel, prepare
 from ..numerics.gaussian import Gaussian
 from ..numerics.parallel import each
@@ -56,10 +57,6 @@ class EMState(NamedTuple):
 
 
 RESTED, STEP_REFUSED, SPENT = "at rest", "no step raises the likelihood", "epochs spent"
-
-
-class FitError(RuntimeError):
-    """EM cannot go on: every sequence is lost."""
 
 
 class Schedule(eqx.Module):

@@ -9,13 +9,14 @@ from jaxtyping import Float, PRNGKeyArray
 
 from ..data.dataset import Dataset
 from ..em.mstep import not_diverged
+from ..errors import DesignError
 from ..fit.identify import Identified
 from ..fit.predict import drawn_paths, posterior_of
 from ..numerics.digits import counted
 from ..storage.log import Log, silent
 from .criteria import Criterion, Information, share, some
 from .information import Fit, information, known
-from .limits import DesignError, Limits, limits_of
+from .limits import Limits, limits_of
 from .play import allowed, motions
 from .search import DESIGN_EFFORT, Effort, Plan, Setup, evaluated, search
 from .signals import Proposal, played, starts

@@ -10,11 +10,8 @@ from jaxtyping import Bool, Float
 from ..data.dataset import Dataset
 from ..data.limits import Range
 from ..data.rig import Rig
+from ..errors import DesignError
 from ..systems import AbstractSystem
-
-
-class DesignError(ValueError):
-    """No experiment can be designed: the message has the reason and a hint."""
 
 
 class Limits(NamedTuple):

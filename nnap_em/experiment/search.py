@@ -11,12 +11,13 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, PRNGKeyArray
 
+from ..errors import DesignError
 from ..fit.predict import Paths
 from ..storage.journal import HERE, step
 from ..storage.log import Log, silent
 from .criteria import Criterion, Information, some
 from .information import Fit, information
-from .limits import DesignError, Limits
+from .limits import Limits
 from .play import allowed, blank, motions
 from .signals import Proposal, drawn, mutated, played, starts
 

@@ -12,13 +12,13 @@ from jaxtyping import Float
 from .. import __version__
 from ..data.servo import TORQUE
 from ..effects import AbstractEffect
+from ..errors import ExportError
 from ..fit.identify import Identified
 from ..machines.spec import compiled, in_comment, mujoco, written
 from ..model import hooks
 from ..storage.files import replace_own
 from ..systems.tree import Tree
 from .friction import REPORTED_MISS, FrictionForm, friction_forms
-from .model import ExportError
 from .placement import Drive, OpenFile, late, placed, sensor
 
 

@@ -8,15 +8,12 @@ import numpy as np
 
 from .. import __version__
 from ..effects import AbstractEffect
+from ..errors import ExportError
 from ..fit.identify import Identified, friction_table, parameter_table
 from ..model.state_space import StateSpaceModel
 from ..report.tables import json_text
 from ..storage.files import replace_own
 from ..systems import AbstractPlant
-
-
-class ExportError(ValueError):
-    """A model that has no form outside JAX; the message names the reason."""
 
 
 def write_model(fitted: Identified, out: Path | str) -> None:

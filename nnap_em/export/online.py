@@ -14,6 +14,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Float
 
 from .. import __version__
+from ..errors import ExportError
 from ..fit import observer as observing
 from ..fit.identify import Identified
 from ..model import hooks
@@ -22,7 +23,6 @@ from ..model.state_space import Inputs, StateSpaceModel
 from ..smoother.mixture import WIDE_STD
 from ..storage.files import replace_own
 from .c99 import WHOLE, Dialect, function, identifier
-from .model import ExportError
 from .unroll import named, unroll
 
 DEGREE = 7

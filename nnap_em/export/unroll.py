@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend import core
 
-from .model import ExportError
+from ..errors import ExportError
 
 
 class Op(NamedTuple):

@@ -9,12 +9,12 @@ from scipy.spatial.transform import Rotation
 
 from .. import __version__
 from ..data.machine import AXES, PAIRS
+from ..errors import ExportError
 from ..fit.identify import Identified
 from ..machines.spec import in_comment
 from ..storage.files import replace_own
 from .friction import REPORTED_MISS, friction_forms
 from .mjcf import as_it_is, named, servos_of
-from .model import ExportError
 
 
 def write_urdf(fitted: Identified, out: Path | str) -> list[str]:

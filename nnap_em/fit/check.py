@@ -13,13 +13,14 @@ from ..data.dataset import Array, Dataset
 from ..data.logs import REPEAT, Logs, logs_of_arrays
 from ..data.machine import unpacked
 from ..data.noise import fast_reading_noise
-from ..data.rig import HOLD, SMOOTH, Rig, RigError
+from ..data.rig import HOLD, SMOOTH, Rig
 from ..data.servo import TORQUE
 from ..em.build import LAG, NO_MACHINE, Scales, build_system, measure_scales
 from ..em.equations import infinite_rates, motion
 from ..em.readings import onset
 from ..em.servos import build_servos, steps_of_sample
 from ..em.simulated import filter_path
+from ..errors import RigError
 from ..model.base import prepare
 from ..model.friction import NoFriction
 from ..model.state_space import MOST_STEPS, StateSpaceModel

@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from ..data.dataset import Dataset, stepped
 from ..data.logs import Logs, logs_of_arrays, sequences_of
-from ..data.rig import Declared, Rig, RigError
+from ..data.rig import Declared, Rig
 from ..data.units import quantities
 from ..effects import AbstractEffect
 from ..em import simulated
@@ -35,6 +35,7 @@ from ..em.multistep import JUDGED, LEAST_FALL, errors, finish, followed, ratio
 from ..em.prior import ParameterPrior
 from ..em.readings import white_readings
 from ..em.stated import widened
+from ..errors import RigError
 from ..model.state_space import StateSpaceModel, with_effects
 from ..numerics.digits import counted
 from ..smoother.gaussian import CubatureSmoother

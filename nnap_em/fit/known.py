@@ -8,12 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PRNGKeyArray
 
-from ..data.dataset import DataError, Dataset
+from ..data.dataset import Dataset
 from ..data.machine import unpacked
 from ..data.rig import Rig
 from ..em.loop import EPOCHS, later_state
 from ..em.mstep import ScoringMStep
 from ..em.weights import Known
+from ..errors import DataError
 from ..model.state_space import StateSpaceModel
 from ..smoother.gaussian import CubatureSmoother
 from .identify import Identified, MakeSmoother, Watch, begin, identify, unwatched

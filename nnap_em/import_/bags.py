@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..data.dataset import DataError
 from ..data.formats import refuse, unreadable
+from ..errors import DataError
 from .clock import Messages, choose
 from .objects import flatten, pick
 from .recording import EXTRA, OTHER, Recording, Topic

@@ -8,10 +8,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from ..data.dataset import DataError
 from ..data.formats import refuse
 from ..data.rig import Rig, nearest, whole_table
 from ..data.units import UNITS, factor, named_unit
+from ..errors import DataError
 from ..numerics.digits import counted
 from .recording import OTHER, Address, Topic, address, places
 

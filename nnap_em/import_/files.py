@@ -4,7 +4,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from ..data.dataset import DataError
+from ..errors import DataError
 from . import bags, hdf5_file, table_file
 from .recording import Address, Recording
 

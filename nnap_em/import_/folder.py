@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from ..data.dataset import DataError
 from ..data.formats import write_csv
 from ..data.rig import Rig
+from ..errors import DataError
 from ..numerics.digits import counted
 from .resample import Resampled
 

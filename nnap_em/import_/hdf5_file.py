@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from ..data.dataset import DataError
 from ..data.dates import dated
 from ..data.formats import refuse, unreadable
 from ..data.units import UNITS, is_time, named_unit
+from ..errors import DataError
 from .clock import nanoseconds, rising
 from .objects import LISTED_ENTRIES
 from .recording import EXTRA, Recording, Topic, Track

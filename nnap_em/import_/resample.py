@@ -9,10 +9,10 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from ..data.dataset import DataError
 from ..data.formats import refuse
 from ..data.rig import SMOOTH, Rig, nearest
 from ..data.units import other_unit
+from ..errors import DataError
 from ..numerics.digits import counted
 from .columns import LONGEST, Plan, in_unit, resolve
 from .files import read, reader

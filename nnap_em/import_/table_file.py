@@ -11,7 +11,6 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Int
 
-from ..data.dataset import DataError
 from ..data.formats import (
     ArrayTable,
     TextTable,
@@ -26,6 +25,7 @@ from ..data.formats import (
     untimed,
 )
 from ..data.units import UNITS, clock_of, is_episode, named_unit
+from ..errors import DataError
 from .clock import in_a_row, nanoseconds, rising
 from .recording import EXTRA, SECOND, UNTIMED, Recording, Topic, Track
 from .text_file import CODESYS, layout, plain

@@ -8,12 +8,12 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..data.dataset import DataError
 from ..data.formats import header_hint
 from ..data.noise import reading_noise
 from ..data.rig import SystemSpec
 from ..data.table import toml_key, toml_text
 from ..data.units import named_unit, parameter_unit, si
+from ..errors import DataError
 from ..import_.files import read, reader
 from ..import_.recording import UNTIMED, Address, Topic, last_word, places
 from ..import_.signals import Signal, interpolated

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from ..data.dataset import DataError
 from ..data.noise import fast_reading_noise, resolution
 from ..data.table import toml_text
 from ..data.units import named_unit
+from ..errors import DataError
 from ..import_.files import reader
 from ..import_.recording import Address
 from ..systems.expression import FUNCTIONS

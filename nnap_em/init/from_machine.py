@@ -5,10 +5,10 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
-from ..data.dataset import DataError
 from ..data.machine import SENSE_UNITS, Machine, machine_unit, packed, states
 from ..data.servo import TORQUE
 from ..data.table import toml_key, toml_text
+from ..errors import DataError
 from ..import_.files import reader
 from ..import_.recording import Address, Topic, places
 from ..machines.locked import Part

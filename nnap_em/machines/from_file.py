@@ -7,9 +7,10 @@ from functools import partial
 import numpy as np
 
 from ..data.machine import OF_BODY, PAIRS, SENSE_UNITS, Machine, Motor, Sensor, of_body, packed, states
-from ..data.rig import Declaration, RigWarning, SystemSpec, every, nearest
+from ..data.rig import Declaration, SystemSpec, every, nearest
 from ..data.servo import TORQUE, Drive, read_inputs
 from ..data.table import Declared, Table
+from ..errors import RigWarning
 from .mjcf import Part, read_file
 from .spec import uncommented
 

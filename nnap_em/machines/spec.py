@@ -7,14 +7,10 @@ import warnings
 from pathlib import Path
 from typing import Any, NoReturn
 
-from ..data.rig import RigError, RigWarning
+from ..errors import MachineError, RigWarning
 
 DIGITS = 15
 """Significant digits of a written number: those that a decimal number keeps as a double; MuJoCo's own are 6."""
-
-
-class MachineError(RigError):
-    """A machine file that cannot be used: the message names the file, the obstacle, and the remedy."""
 
 
 def refuse(path: Path, problem: str, hint: str) -> NoReturn:

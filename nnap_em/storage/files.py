@@ -14,10 +14,7 @@ from typing import Any, NamedTuple, NoReturn
 import numpy as np
 
 from .. import __version__
-
-
-class StoreError(ValueError):
-    """A file that is not what it should be: the message names the file, the mistake and a hint."""
+from ..errors import StoreError
 
 
 class Kind(NamedTuple):

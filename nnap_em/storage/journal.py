@@ -18,10 +18,11 @@ from typing import Any, TypeVar
 
 import jax
 
+from ..errors import StoreError
 from ..numerics.digest import digest, surroundings
 from ..numerics.parallel import everywhere
 from .deadline import in_time
-from .files import Kind, StoreError, read_arrays, sweep, write_arrays
+from .files import Kind, read_arrays, sweep, write_arrays
 from .leaves import describe, name_of, restore
 
 STEP_KIND = Kind("nnap_em finished step", 2, "finished step", *2 * ["it is done again"])

@@ -6,8 +6,9 @@ from functools import partial
 from ..data.rig import Declaration, SystemSpec, every, nearest
 from ..data.servo import Inputs
 from ..data.table import Declared, Table
+from ..errors import FormulaError
 from .equations import Text
-from .expression import FUNCTIONS, Formula, FormulaError, parse
+from .expression import FUNCTIONS, Formula, parse
 
 
 def declare(root: Table, of: Text | None = None) -> Declaration:

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple, NoReturn
 import jax.numpy as jnp
 
 from ..data.rig import nearest
+from ..errors import FormulaError
 from .plant import Scalar
 
 Values = Mapping[str, Any]
@@ -38,10 +39,6 @@ _OPERATORS: dict[type, Callable[..., Any]] = {
     ast.Div: lambda a, b: a / b, ast.Pow: lambda a, b: a**b, ast.USub: lambda a: -a, ast.UAdd: lambda a: a,
     ast.Lt: lambda a, b: a < b, ast.LtE: lambda a, b: a <= b, ast.Gt: lambda a, b: a > b, ast.GtE: lambda a, b: a >= b,
 }  # fmt: skip
-
-
-class FormulaError(ValueError):
-    """A mistake in a formula: the place in its text, the problem and the remedy."""
 
 
 class Formula(NamedTuple):

@@ -23,7 +23,7 @@ def main() -> None:
         since = datetime.fromisoformat(_git("show", "-s", "--format=%cI", "HEAD").strip()) - timedelta(hours=4)
         changed = set(_git("log", f"--since={since.isoformat()}", "--name-only", "--format=").split())
     except (OSError, subprocess.CalledProcessError):  # no clone: all of them
-        changed = {"nnap_em/numerics/"}
+        changed = {"nnap_em/base/"}
     inside = [name.split("/")[1] for name in changed if name.startswith("nnap_em/")]
     first = min((FOLDERS.index(folder) if folder in FOLDERS else 0 for folder in inside), default=len(FOLDERS))
     for path in sorted((ROOT / "tests").glob("test_*.py")):

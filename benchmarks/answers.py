@@ -23,10 +23,10 @@ sys.path.append(str(ROOT / "examples"))
 import plant
 import tanks
 
-from nnap_em.commands.common import MISFIT_STATUS
-from nnap_em.storage.files import cores, replace_text
+from nnap_em.base.files import cores, replace_text
+from nnap_em.cli.common import MISFIT_STATUS
 
-NNAP_EM = [sys.executable, "-m", "nnap_em.commands.cli"]
+NNAP_EM = [sys.executable, "-m", "nnap_em.cli.main"]
 DATA = ROOT.parent / "shared" / "data"
 
 

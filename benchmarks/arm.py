@@ -25,10 +25,10 @@ import numpy as np
 from machines import arm
 
 from nnap_em import identify
-from nnap_em.commands.common import set_up
-from nnap_em.data.dataset import Dataset
-from nnap_em.data.rig import Rig, read_rig
-from nnap_em.systems import specs
+from nnap_em.cli.common import set_up
+from nnap_em.logs.dataset import Dataset
+from nnap_em.machines.rig import Rig, read_rig
+from nnap_em.machines.systems import specs
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "examples"))
 from machine_files import DT, FINE, errors

@@ -23,8 +23,8 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.stats
 
-from nnap_em.data.rig import Declared, Rig
-from nnap_em.fit.identify import Identified, begin, friction_table, identify
+from nnap_em.estimate.identify import Identified, begin, friction_table, identify
+from nnap_em.machines.rig import Declared, Rig
 from nnap_em.model.law import StribeckLaw
 from nnap_em.model.simulate import Experiment, Sweep, examples, sweep_experiment
 from nnap_em.model.state_space import StateSpaceModel

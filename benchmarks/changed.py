@@ -36,11 +36,11 @@ from planted import _commit, score
 from planted_cases import REST, case_of
 from planted_make import DATA, ROOT, make, needed, read
 
-from nnap_em.commands.common import MISFIT_STATUS
-from nnap_em.data.formats import write_csv
-from nnap_em.data.rig import Declared, write_rig
+from nnap_em.base.files import replace_text
+from nnap_em.cli.common import MISFIT_STATUS
+from nnap_em.logs.formats import write_csv
+from nnap_em.machines.rig import Declared, write_rig
 from nnap_em.model.simulate import declared, examples, sweep_experiment
-from nnap_em.storage.files import replace_text
 
 COLUMNS = "case", "in the recordings", "named", "right", "false", "outcome", "processor [s]", "commit"
 UNCERTAIN = {"slide": {"m": 0.1}, "pendulum": {"m": 0.05}, "acrobot": {"m2": 0.06}}
@@ -52,7 +52,7 @@ def command(*arguments: str | Path) -> tuple[int, float, str]:
     """Exit status, processor seconds and last line of a command."""
     environment = os.environ | {"JAX_NUM_CPU_DEVICES": "1", "PYTHONPATH": str(ROOT)}
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    line = [sys.executable, "-m", "nnap_em.commands.cli", *map(str, arguments)]
+    line = [sys.executable, "-m", "nnap_em.cli.main", *map(str, arguments)]
     done = subprocess.run(line, env=environment, capture_output=True, text=True, check=False)
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     spent = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime

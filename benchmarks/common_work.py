@@ -15,16 +15,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from nnap_em.data.dataset import Dataset
-from nnap_em.em.loop import e_step
+from nnap_em.base.gaussian import Gaussian
+from nnap_em.estimate.em.loop import e_step
+from nnap_em.estimate.smoother.gaussian import ExtendedKalmanSmoother
+from nnap_em.estimate.smoother.particle import ffbs, particle_filter
+from nnap_em.estimate.smoother.start import StartBank
+from nnap_em.logs.dataset import Dataset
 from nnap_em.model.base import prepare
 from nnap_em.model.friction import AbstractJointMap
 from nnap_em.model.simulate import Experiment, paper_friction, paper_model, paper_sweep, sweep_experiment
 from nnap_em.model.state_space import StateSpaceModel
-from nnap_em.numerics.gaussian import Gaussian
-from nnap_em.smoother.gaussian import ExtendedKalmanSmoother
-from nnap_em.smoother.particle import ffbs, particle_filter
-from nnap_em.smoother.start import StartBank
 
 START, START_STD = (math.pi / 2, 0.0, 0.0, 0.0), (0.05, 0.05, 0.05, 0.05)
 """Prior of the first row: the arm held out level, at rest [rad, rad/s]."""

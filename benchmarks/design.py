@@ -24,13 +24,13 @@ import numpy as np
 import plant
 
 import nnap_em
-from nnap_em.commands import common
-from nnap_em.data.dataset import Dataset, pad
-from nnap_em.data.limits import Bounds
-from nnap_em.experiment.criteria import after
-from nnap_em.experiment.experiment import Design, design
-from nnap_em.fit.identify import Identified, friction_table, identify
-from nnap_em.storage.files import cores, replace_text
+from nnap_em.base.files import cores, replace_text
+from nnap_em.cli import common
+from nnap_em.estimate.identify import Identified, friction_table, identify
+from nnap_em.explain.design.criteria import after
+from nnap_em.explain.design.experiment import Design, design
+from nnap_em.logs.dataset import Dataset, pad
+from nnap_em.machines.limits import Bounds
 
 SEQUENCES = 6
 """Of 5 s: 30 s."""

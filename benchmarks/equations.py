@@ -17,11 +17,11 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from nnap_em.data.dataset import pad
-from nnap_em.data.rig import read_rig
-from nnap_em.diagnosis.diagnose import diagnose
-from nnap_em.diagnosis.keys import Key, key_of, words
-from nnap_em.systems import specs
+from nnap_em.explain.diagnosis.diagnose import diagnose
+from nnap_em.explain.diagnosis.keys import Key, key_of, words
+from nnap_em.logs.dataset import pad
+from nnap_em.machines.rig import read_rig
+from nnap_em.machines.systems import specs
 
 STEPS = 20
 """Runge-Kutta steps in a row."""

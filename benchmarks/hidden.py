@@ -21,12 +21,12 @@ import jax.numpy as jnp
 import numpy as np
 from identify import nrmse, paper_rig, visited
 
-from nnap_em.em.loop import e_step
-from nnap_em.fit.identify import friction_table, identify
-from nnap_em.fit.predict import posterior_of
+from nnap_em.estimate.em.loop import e_step
+from nnap_em.estimate.identify import friction_table, identify
+from nnap_em.estimate.predict import posterior_of
+from nnap_em.estimate.smoother.gaussian import CubatureSmoother
+from nnap_em.estimate.smoother.start import StartBank
 from nnap_em.model.simulate import paper_experiment, paper_model, simulate
-from nnap_em.smoother.gaussian import CubatureSmoother
-from nnap_em.smoother.start import StartBank
 
 LOST = 0.3
 """Root mean square error of theta2 beyond which a sequence is on another branch [rad]."""

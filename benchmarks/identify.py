@@ -21,17 +21,17 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from nnap_em.data.rig import Declared, Rig
-from nnap_em.em.loop import Schedule, e_step, em_step
-from nnap_em.em.quadratic import local, quadratic, readings_at
-from nnap_em.fit.identify import Identified, begin, friction_table, identify
-from nnap_em.fit.predict import predict
+from nnap_em.estimate.em.loop import Schedule, e_step, em_step
+from nnap_em.estimate.em.quadratic import local, quadratic, readings_at
+from nnap_em.estimate.identify import Identified, begin, friction_table, identify
+from nnap_em.estimate.predict import predict
+from nnap_em.estimate.smoother.gaussian import CubatureSmoother, ExtendedKalmanSmoother
+from nnap_em.estimate.smoother.particle.smoother import banked
+from nnap_em.estimate.smoother.start import StartBank
+from nnap_em.machines.rig import Declared, Rig
+from nnap_em.machines.systems.acrobot import table_i
 from nnap_em.model.friction import FixedFriction
 from nnap_em.model.simulate import paper_experiment, paper_model
-from nnap_em.smoother.gaussian import CubatureSmoother, ExtendedKalmanSmoother
-from nnap_em.smoother.particle.smoother import banked
-from nnap_em.smoother.start import StartBank
-from nnap_em.systems.acrobot import table_i
 
 whole = Schedule(first=501)
 one_start = StartBank((1, 1, 1, 1))

@@ -92,7 +92,7 @@ def main() -> None:
             rig.write_text(RIG)
             words = ["import", str(log), "--out", f"{spare}/out", "--rig", str(rig)]
             began = time.perf_counter()
-            process = subprocess.Popen([sys.executable, "-m", "nnap_em.commands.cli", *words])
+            process = subprocess.Popen([sys.executable, "-m", "nnap_em.cli.main", *words])
             _, status, used = os.wait4(process.pid, 0)
             if status:
                 raise SystemExit(f"import ended with status {status}")

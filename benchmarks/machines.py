@@ -2,9 +2,9 @@
 
 from pathlib import Path
 
-from nnap_em.data.machine import packed, states
-from nnap_em.machines.mjcf import read_machine
-from nnap_em.systems import AbstractSystem, systems
+from nnap_em.machines.files.mjcf import read_machine
+from nnap_em.machines.machine import packed, states
+from nnap_em.machines.systems import AbstractSystem, systems
 
 AXES = ("0 0 1", "0 1 0", "0 1 0", "0 0 1", "0 1 0", "0 0 1", "0 1 0")
 PLACES = ("0 0 0", "0 0 0.15", "0 0 0.3", "0.03 0 0.25", "0 0 0.1", "0 0 0.08", "0 0 0.06")

@@ -17,11 +17,11 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from nnap_em.data.logs import read_logs
-from nnap_em.data.rig import read_rig
-from nnap_em.fit.identify import identify, parameter_table
-from nnap_em.fit.predict import posterior_of, predict
-from nnap_em.systems import specs
+from nnap_em.estimate.identify import identify, parameter_table
+from nnap_em.estimate.predict import posterior_of, predict
+from nnap_em.logs.read import read_logs
+from nnap_em.machines.rig import read_rig
+from nnap_em.machines.systems import specs
 
 RIGS = ("dfki_c1_joint1", "dfki_c0_joint1", "dfki_a0_joint1", "dfki_c1", "dfki_c0")
 BASELINE = {  # plain refit of ten rigid-body and friction parameters: theta1 / theta2 RMSE [rad] at 0.2 s and 0.5 s

@@ -21,13 +21,13 @@ import numpy as np
 from observer_c import held, paper_rig, play, replay, rough
 
 import nnap_em
-from nnap_em.data.dataset import Dataset
-from nnap_em.export.online import write_observer
-from nnap_em.fit.identify import Identified, identify
-from nnap_em.fit.observer import RESTARTED, Observer, functions, observer, restart_prior
-from nnap_em.fit.store import load, save
+from nnap_em.estimate.identify import Identified, identify
+from nnap_em.estimate.observer import RESTARTED, Observer, functions, observer, restart_prior
+from nnap_em.estimate.store import load, save
+from nnap_em.logs.dataset import Dataset
 from nnap_em.model.simulate import paper_experiment, paper_model
 from nnap_em.model.state_space import StateSpaceModel
+from nnap_em.output.export.online import write_observer
 
 NATIVE = "-march=native"
 

@@ -10,9 +10,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from nnap_em.data.rig import Declared, Rig
-from nnap_em.fit.observer import Observation, Observer
-from nnap_em.systems.acrobot import table_i
+from nnap_em.estimate.observer import Observation, Observer
+from nnap_em.machines.rig import Declared, Rig
+from nnap_em.machines.systems.acrobot import table_i
 
 SANITIZED = ("-fsanitize=address,undefined", "-fno-sanitize-recover=all", "-g")
 LOOP = """

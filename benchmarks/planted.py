@@ -31,8 +31,8 @@ from planted_cases import CASES, split
 from planted_make import ROOT, make
 from planted_table import cases, score, table
 
-from nnap_em.commands.common import MISFIT_STATUS
-from nnap_em.storage.files import replace_text
+from nnap_em.base.files import replace_text
+from nnap_em.cli.common import MISFIT_STATUS
 
 
 def run(name: str, out: Path, limit: float, core: int) -> dict[str, Any]:
@@ -47,7 +47,7 @@ def run(name: str, out: Path, limit: float, core: int) -> dict[str, Any]:
             for path in case.glob("train/*.csv")
         )
         alone = {"JAX_NUM_CPU_DEVICES": "1", "OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
-        command = [sys.executable, "-m", "nnap_em.commands.cli", "diagnose", str(case), "--out", str(result), "--quiet"]
+        command = [sys.executable, "-m", "nnap_em.cli.main", "diagnose", str(case), "--out", str(result), "--quiet"]
         began = time.perf_counter()
         with Path(folder, "said").open("w+") as said:
             process = subprocess.Popen(command, env=os.environ | alone, stdout=said, stderr=said)

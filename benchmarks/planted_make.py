@@ -26,7 +26,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from planted_cases import STRENGTHS, WRONG, Body, Case, Columns, Motion, Plant, Ranges, Values, case_of, split
 
-from nnap_em.storage.files import replace_text
+from nnap_em.base.files import replace_text
 
 ROOT = Path(__file__).resolve().parent.parent
 DATA = ROOT.parent / "shared" / "data" / "measured"

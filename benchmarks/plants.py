@@ -95,7 +95,7 @@ def run(name: str, out: Path, core: int) -> str:
         shutil.rmtree(old, ignore_errors=True)
     CASES[name](folder)
     environment = os.environ | {"JAX_NUM_CPU_DEVICES": "1", "OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
-    command = [sys.executable, "-m", "nnap_em.commands.cli", "diagnose", str(folder), "--out", str(found)]
+    command = [sys.executable, "-m", "nnap_em.cli.main", "diagnose", str(folder), "--out", str(found)]
     with (out / f"{name}.log").open("w") as said:
         process = subprocess.Popen(command, env=environment, stdout=said, stderr=said)
         os.sched_setaffinity(process.pid, {core})

@@ -19,9 +19,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from nnap_em.data.dataset import Dataset, pad
-from nnap_em.data.rig import Declared, Rig
-from nnap_em.fit.identify import friction_table, identify
+from nnap_em.estimate.identify import friction_table, identify
+from nnap_em.logs.dataset import Dataset, pad
+from nnap_em.machines.rig import Declared, Rig
 from nnap_em.model.law import fit_law
 
 DT, ROWS, LOGS, FINE = 0.01, 600, 6, 100

@@ -26,13 +26,13 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parent.parent / "examples"))
 import plant
 
-from nnap_em.commands.common import set_up
-from nnap_em.data.formats import write_csv
-from nnap_em.data.logs import Logs, read_logs
-from nnap_em.data.rig import read_rig
-from nnap_em.fit.identify import friction_table, identify
-from nnap_em.fit.predict import REPORTED, horizon_errors, predict
-from nnap_em.systems import specs
+from nnap_em.cli.common import set_up
+from nnap_em.estimate.identify import friction_table, identify
+from nnap_em.estimate.predict import REPORTED, horizon_errors, predict
+from nnap_em.logs.formats import write_csv
+from nnap_em.logs.read import Logs, read_logs
+from nnap_em.machines.rig import read_rig
+from nnap_em.machines.systems import specs
 
 CASES = {
     "acrobot": plant.Case(seed=1),

@@ -22,12 +22,12 @@ import mujoco
 import numpy as np
 from machines import arm
 
-from nnap_em.data.dataset import Dataset
-from nnap_em.data.rig import Rig, read_rig
-from nnap_em.diagnosis.diagnose import diagnose
-from nnap_em.diagnosis.findings import findings
-from nnap_em.fit.identify import Identified, identify, parameter_table
-from nnap_em.systems import specs
+from nnap_em.estimate.identify import Identified, identify, parameter_table
+from nnap_em.explain.diagnosis.diagnose import diagnose
+from nnap_em.explain.diagnosis.findings import findings
+from nnap_em.logs.dataset import Dataset
+from nnap_em.machines.rig import Rig, read_rig
+from nnap_em.machines.systems import specs
 
 jax.config.update("jax_enable_x64", True)
 DT, INNER = 0.01, 20

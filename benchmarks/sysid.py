@@ -30,13 +30,13 @@ import mujoco
 import numpy as np
 from mujoco import rollout, sysid
 
-from nnap_em.data.dataset import Dataset
-from nnap_em.data.logs import read_logs
-from nnap_em.data.rig import Rig, read_rig
-from nnap_em.fit.identify import Identified, identify
-from nnap_em.fit.predict import predict
-from nnap_em.systems import specs
-from nnap_em.systems.arm import TwoLinkArm
+from nnap_em.estimate.identify import Identified, identify
+from nnap_em.estimate.predict import predict
+from nnap_em.logs.dataset import Dataset
+from nnap_em.logs.read import read_logs
+from nnap_em.machines.rig import Rig, read_rig
+from nnap_em.machines.systems import specs
+from nnap_em.machines.systems.arm import TwoLinkArm
 
 RIGS = ("dfki_c1", "dfki_c1_pert", "dfki_c0", "dfki_a0", "cloudpendulum")
 HORIZONS = (0.25, 0.5, 1.0)

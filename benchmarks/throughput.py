@@ -21,8 +21,8 @@ import numpy as np
 from common_work import Case, Size, common_logs, filter_case, one_start, paths_case, smoother_case, wide_bank
 from peers import cuthbert_case, cuthbert_exact, dynamax_case
 
-from nnap_em.smoother.gaussian import CubatureSmoother, ExtendedKalmanSmoother
-from nnap_em.smoother.particle import Bootstrap, ExactBackward, Guided
+from nnap_em.estimate.smoother.gaussian import CubatureSmoother, ExtendedKalmanSmoother
+from nnap_em.estimate.smoother.particle import Bootstrap, ExactBackward, Guided
 
 BUDGET = 5.0
 """Time of a row after its third run [s]."""

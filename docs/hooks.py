@@ -13,9 +13,9 @@ from xml.etree.ElementTree import tostring
 
 from latex2mathml.converter import convert_to_element
 
-from nnap_em.commands.cli import parser
-from nnap_em.effects import catalogue
-from nnap_em.export.placement import PLACES
+from nnap_em.cli.main import parser
+from nnap_em.model.effects import catalogue
+from nnap_em.output.export.placement import PLACES
 
 ROOT = Path(__file__).resolve().parents[1]
 BAR = r"\|"
@@ -85,7 +85,7 @@ def _place(name: str) -> str:
 
 def verdict() -> str:
     """A row for each number that decides whether an effect enters a model or leaves it."""
-    body = ast.parse((ROOT / "nnap_em/diagnosis/verdict.py").read_text()).body
+    body = ast.parse((ROOT / "nnap_em/explain/diagnosis/verdict.py").read_text()).body
     rows = ["| number | value | meaning |", "| --- | --- | --- |"]
     for number, text in itertools.pairwise(body):
         if isinstance(number, ast.Assign) and isinstance(text, ast.Expr) and isinstance(text.value, ast.Constant):

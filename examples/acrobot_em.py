@@ -20,22 +20,22 @@ import numpy as np
 from blackbox import GradientMStep, build_network, forecast
 from paper_figures import Band, Curve, Record, friction_epochs_figure, prediction_figure, states_figure
 
-from nnap_em.data.dataset import Dataset
-from nnap_em.data.rig import Declared, Rig
-from nnap_em.em.build import build
-from nnap_em.em.loop import EMState, Schedule, e_step, fit, start_state
-from nnap_em.em.mstep import AbstractMStep
-from nnap_em.fit.predict import given_samples
+from nnap_em.base.files import cores
+from nnap_em.base.parallel import use_every_device
+from nnap_em.base.programs import use_older_emitters
+from nnap_em.estimate.em.build import build
+from nnap_em.estimate.em.loop import EMState, Schedule, e_step, fit, start_state
+from nnap_em.estimate.em.mstep import AbstractMStep
+from nnap_em.estimate.predict import given_samples
+from nnap_em.estimate.smoother import AbstractSmoother
+from nnap_em.estimate.smoother.gaussian import CubatureSmoother, ExtendedKalmanSmoother, GaussianSmoother
+from nnap_em.estimate.smoother.particle import Guided, ParticleSmoother
+from nnap_em.estimate.smoother.start import StartBank
+from nnap_em.logs.dataset import Dataset
+from nnap_em.machines.rig import Declared, Rig
+from nnap_em.machines.systems.acrobot import table_i
 from nnap_em.model.base import prepare
 from nnap_em.model.simulate import Experiment, paper_experiment, paper_model
-from nnap_em.numerics.parallel import use_every_device
-from nnap_em.numerics.programs import use_older_emitters
-from nnap_em.smoother import AbstractSmoother
-from nnap_em.smoother.gaussian import CubatureSmoother, ExtendedKalmanSmoother, GaussianSmoother
-from nnap_em.smoother.particle import Guided, ParticleSmoother
-from nnap_em.smoother.start import StartBank
-from nnap_em.storage.files import cores
-from nnap_em.systems.acrobot import table_i
 
 EPOCHS = (1, 5, 10, 20)
 """Shown in the figures."""

@@ -15,12 +15,12 @@ import optax
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from nnap_em.data.dataset import Dataset, active_steps, fill_missing
-from nnap_em.em.build import reading_noise
-from nnap_em.em.mstep import AbstractMStep, MStepInfo, not_diverged
+from nnap_em.base.gaussian import Gaussian, cholesky, lower
+from nnap_em.estimate.em.build import reading_noise
+from nnap_em.estimate.em.mstep import AbstractMStep, MStepInfo, not_diverged
+from nnap_em.estimate.smoother.posterior import Posterior
+from nnap_em.logs.dataset import Dataset, active_steps, fill_missing
 from nnap_em.model.base import AbstractModel
-from nnap_em.numerics.gaussian import Gaussian, cholesky, lower
-from nnap_em.smoother.posterior import Posterior
 
 
 class NetworkModel(AbstractModel):

@@ -17,8 +17,8 @@ from pathlib import Path
 
 import plant
 
-from nnap_em.commands.cli import main as nnap_em
-from nnap_em.commands.common import MISFIT_STATUS
+from nnap_em.cli.common import MISFIT_STATUS
+from nnap_em.cli.main import main as nnap_em
 
 SLIDE = (
     {"name": "torsional_spring", "joint": 1, "k": 20.0, "theta0": 0.05},

@@ -20,8 +20,8 @@ from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from nnap_em.commands.common import set_up
-from nnap_em.report.style import NORMAL_90, STYLE
+from nnap_em.cli.common import set_up
+from nnap_em.output.report.style import NORMAL_90, STYLE
 
 SIZE = (4.4, 2.9)
 """Width and height of a picture [in]."""

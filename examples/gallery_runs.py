@@ -17,10 +17,10 @@ import measured_loop
 import numpy as np
 
 from nnap_em import friction_table, identify, read_logs, read_rig
-from nnap_em.commands.cli import main as nnap_em
-from nnap_em.commands.common import MISFIT_STATUS
-from nnap_em.diagnosis.interventions import WINDOWS, averaged, interventions
-from nnap_em.diagnosis.residual import residual
+from nnap_em.cli.common import MISFIT_STATUS
+from nnap_em.cli.main import main as nnap_em
+from nnap_em.explain.diagnosis.interventions import WINDOWS, averaged, interventions
+from nnap_em.explain.diagnosis.residual import residual
 
 ROOT = Path(__file__).resolve().parents[1]
 MEASURED = ROOT.parent / "shared" / "data" / "measured"

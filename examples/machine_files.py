@@ -17,11 +17,11 @@ import mujoco
 import numpy as np
 
 from nnap_em import identify
-from nnap_em.data.dataset import Dataset
-from nnap_em.data.machine import unpacked
-from nnap_em.data.rig import read_rig
-from nnap_em.numerics.programs import use_older_emitters
-from nnap_em.systems import specs
+from nnap_em.base.programs import use_older_emitters
+from nnap_em.logs.dataset import Dataset
+from nnap_em.machines.machine import unpacked
+from nnap_em.machines.rig import read_rig
+from nnap_em.machines.systems import specs
 
 HERE = Path(__file__).resolve().parent / "machines"
 DT, FINE = 0.01, 20

@@ -8,7 +8,7 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from nnap_em.report.style import AFTER, BEFORE, READING, TRUTH, ZERO_LINE, dotted, head, styled
+from nnap_em.output.report.style import AFTER, BEFORE, READING, TRUTH, ZERO_LINE, dotted, head, styled
 
 
 class MissingTorque(NamedTuple):

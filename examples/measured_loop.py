@@ -28,9 +28,9 @@ from measured_figures import MissingTorque, errors_figure, finding_figure
 from recordings import RecordingError, beginning, recordings, write
 
 from nnap_em import Identified, horizon_errors, load, predict, read_logs
-from nnap_em.commands.cli import main as nnap_em
-from nnap_em.commands.common import MISFIT_STATUS, set_up
-from nnap_em.diagnosis.residual import residual
+from nnap_em.cli.common import MISFIT_STATUS, set_up
+from nnap_em.cli.main import main as nnap_em
+from nnap_em.explain.diagnosis.residual import residual
 
 RIG = Path(__file__).resolve().parent / "machines" / "dfki_acrobot.toml"
 TEST = 2
@@ -86,7 +86,7 @@ def prepared(source: list[Path], out: Path, law: str | None) -> None:
 def diagnose(folders: list[Path]) -> None:
     """Find what the model lacks in every folder, all at once and on one core each; raises SystemExit where it fails."""
     environment = os.environ | {"JAX_NUM_CPU_DEVICES": "1"}
-    command = [sys.executable, "-m", "nnap_em.commands.cli", "diagnose"]
+    command = [sys.executable, "-m", "nnap_em.cli.main", "diagnose"]
     processes = {
         folder.name: subprocess.Popen(
             [*command, str(folder / "data"), "--out", str(folder / "found")],

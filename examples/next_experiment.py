@@ -17,8 +17,8 @@ from pathlib import Path
 import numpy as np
 import plant
 
-from nnap_em.commands.cli import main as nnap_em
-from nnap_em.commands.common import MISFIT_STATUS
+from nnap_em.cli.common import MISFIT_STATUS
+from nnap_em.cli.main import main as nnap_em
 
 EFFECTS = {
     "input_delay": {"name": "input_delay", "joint": 2, "delay": 0.004},

@@ -8,7 +8,7 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from nnap_em.report.style import (
+from nnap_em.output.report.style import (
     BLUE,
     GREEN,
     NORMAL_90,

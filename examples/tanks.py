@@ -27,10 +27,10 @@ from jaxtyping import Float
 from matplotlib.figure import Figure
 
 from nnap_em import load, predict, read_logs
-from nnap_em.commands.cli import main as nnap_em
-from nnap_em.commands.common import set_up
+from nnap_em.cli.common import set_up
+from nnap_em.cli.main import main as nnap_em
 from nnap_em.errors import DataWarning
-from nnap_em.report.style import AFTER, BEFORE, READING, head, styled
+from nnap_em.output.report.style import AFTER, BEFORE, READING, head, styled
 
 RIG = Path(__file__).resolve().parent / "machines" / "tanks.toml"
 PUBLISHED = "dataBenchmark.csv"

@@ -30,8 +30,8 @@ import plant
 from matplotlib.figure import Figure
 
 import nnap_em
-from nnap_em.diagnosis.residual import names_of, residual
-from nnap_em.report.fit_plots import error_figure, friction_figure
+from nnap_em.explain.diagnosis.residual import names_of, residual
+from nnap_em.output.report.fit_plots import error_figure, friction_figure
 
 jax.config.update("jax_enable_x64", True)
 

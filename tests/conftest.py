@@ -33,7 +33,7 @@ def pytest_configure(config: pytest.Config) -> None:
 def _programs():
     """After each file, programs are let go where they hold many memory maps: a worker runs hundreds of tests."""
     yield
-    from nnap_em.numerics.programs import release_programs
+    from nnap_em.base.programs import release_programs
 
     release_programs(35_000)
 
@@ -52,6 +52,6 @@ def slide_fit():
     """A fit of `slide_rig()` to `slide_logs(0)`."""
     from rigs import slide_logs, slide_rig
 
-    from nnap_em.fit.identify import identify
+    from nnap_em.estimate.identify import identify
 
     return identify(slide_rig(), slide_logs(0), key=jax.random.key(0))

@@ -10,23 +10,23 @@ import jax.numpy as jnp
 import numpy as np
 import plant
 
-from nnap_em.commands import cli
-from nnap_em.data.dataset import Dataset
-from nnap_em.data.formats import columns_of, table_of
-from nnap_em.data.rig import Rig, read_rig, write_rig
-from nnap_em.diagnosis.residual import Residual
-from nnap_em.effects.base import SearchScales
-from nnap_em.em.build import build_system
-from nnap_em.em.mstep import ScoringMStep
-from nnap_em.em.prior import ParameterPrior
-from nnap_em.em.servos import build_servos
-from nnap_em.fit.identify import Identified, begin
+from nnap_em.base.gaussian import Gaussian
+from nnap_em.cli import main as cli
+from nnap_em.estimate.em.build import build_system
+from nnap_em.estimate.em.mstep import ScoringMStep
+from nnap_em.estimate.em.prior import ParameterPrior
+from nnap_em.estimate.em.servos import build_servos
+from nnap_em.estimate.identify import Identified, begin
+from nnap_em.explain.diagnosis.residual import Residual
+from nnap_em.logs.dataset import Dataset
+from nnap_em.logs.formats import columns_of, table_of
+from nnap_em.machines.rig import Rig, read_rig, write_rig
+from nnap_em.machines.systems import specs, systems
+from nnap_em.machines.systems.slide import Slide
+from nnap_em.model.effects.base import SearchScales
 from nnap_em.model.friction import FixedFriction, NoFriction
 from nnap_em.model.law import StribeckLaw
 from nnap_em.model.state_space import StateSpaceModel, with_effects
-from nnap_em.numerics.gaussian import Gaussian
-from nnap_em.systems import specs, systems
-from nnap_em.systems.slide import Slide
 
 
 @contextlib.contextmanager

@@ -11,10 +11,10 @@ import numpy as np
 from mcap.writer import CompressionType, IndexType, Writer
 from mcap_ros2._dynamic import serialize_dynamic
 
-from nnap_em.data.rig import read_rig
-from nnap_em.import_.columns import read_plan
-from nnap_em.import_.resample import Resampled, resample
-from nnap_em.systems import specs
+from nnap_em.logs.importing.columns import read_plan
+from nnap_em.logs.importing.resample import Resampled, resample
+from nnap_em.machines.rig import read_rig
+from nnap_em.machines.systems import specs
 
 NS = 1_000_000_000
 EPOCH = 1_700_000_000 * NS

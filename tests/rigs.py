@@ -5,9 +5,9 @@ import dataclasses
 import equinox as eqx
 import jax
 
-from nnap_em.data.dataset import Dataset
-from nnap_em.data.rig import Declared, Rig
-from nnap_em.effects.base import AbstractEffect
+from nnap_em.logs.dataset import Dataset
+from nnap_em.machines.rig import Declared, Rig
+from nnap_em.model.effects.base import AbstractEffect
 from nnap_em.model.simulate import declared, examples, sweep_experiment
 from nnap_em.model.state_space import with_effects
 

@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 from helpers import rig_text
 
-from nnap_em.data.dataset import Dataset
-from nnap_em.data.rig import Rig, read_rig
-from nnap_em.systems import specs
+from nnap_em.logs.dataset import Dataset
+from nnap_em.machines.rig import Rig, read_rig
+from nnap_em.machines.systems import specs
 
 GRAVITY, MASS, LENGTH, INERTIA = 9.81, 1.2, 0.25, 0.01
 """Gravity [m/s^2]; mass of the rod [kg], its centre below the axis [m], its inertia about that centre [kg m^2]."""

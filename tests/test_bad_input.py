@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from helpers import csv_text, rig_text, swing, with_field
 
-from nnap_em.commands import cli
-from nnap_em.commands import identify as identify_command
+from nnap_em.cli import identify as identify_command
+from nnap_em.cli import main as cli
 from nnap_em.errors import FitError
 
 MODEL = 'type = "pendulum"\nm = 0.5\nlc = 0.4\nI = 0.002\ng = 9.81\nfriction = "unknown"\nactuated_joint = 1\n'

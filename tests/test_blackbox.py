@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from blackbox import forecast
 
-from nnap_em.numerics.gaussian import Gaussian
+from nnap_em.base.gaussian import Gaussian
 
 
 class _Oscillator(eqx.Module):

@@ -15,14 +15,14 @@ import pytest
 import scipy.stats
 from helpers import optimised
 
-from nnap_em.data.dataset import Dataset, fill_missing
+from nnap_em.base.gaussian import Gaussian
+from nnap_em.estimate.smoother.gaussian import GaussianSmoother
+from nnap_em.estimate.smoother.kalman import Cubature, Tangent
+from nnap_em.estimate.smoother.start import StartBank
+from nnap_em.logs.dataset import Dataset, fill_missing
 from nnap_em.model.base import prepare
 from nnap_em.model.simulate import examples, paper_model, simulate
 from nnap_em.model.state_space import StateSpaceModel
-from nnap_em.numerics.gaussian import Gaussian
-from nnap_em.smoother.gaussian import GaussianSmoother
-from nnap_em.smoother.kalman import Cubature, Tangent
-from nnap_em.smoother.start import StartBank
 
 RUNS, ROWS = 200, 60
 LEVEL = 1e-3

@@ -10,17 +10,17 @@ import pytest
 from rigs import slide_logs, slide_rig
 
 from nnap_em import diagnose, findings, identify
-from nnap_em.data.rig import Declared
-from nnap_em.diagnosis.findings import changes
-from nnap_em.diagnosis.outcome import Diagnosis
-from nnap_em.diagnosis.verdict import KEEP, RISEN, veto
-from nnap_em.effects.position import TorsionalSpring
-from nnap_em.em.multistep import Linear
-from nnap_em.em.recorded import Risen, level, risen
 from nnap_em.errors import DataError
-from nnap_em.fit.identify import begin
-from nnap_em.fit.known import differences, known
-from nnap_em.fit.store import load, save
+from nnap_em.estimate.em.multistep import Linear
+from nnap_em.estimate.em.recorded import Risen, level, risen
+from nnap_em.estimate.identify import begin
+from nnap_em.estimate.known import differences, known
+from nnap_em.estimate.store import load, save
+from nnap_em.explain.diagnosis.findings import changes
+from nnap_em.explain.diagnosis.outcome import Diagnosis
+from nnap_em.explain.diagnosis.verdict import KEEP, RISEN, veto
+from nnap_em.machines.rig import Declared
+from nnap_em.model.effects.position import TorsionalSpring
 
 GROWN = 0.2
 """Growth of the Coulomb friction of a slide [N]; it is 1."""

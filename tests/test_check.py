@@ -10,18 +10,18 @@ import pytest
 from helpers import file_rig, nnap
 from helpers import slide as slide_model
 
-from nnap_em.data.dataset import Dataset
-from nnap_em.data.logs import REPEAT, Logs, Masked
-from nnap_em.data.rig import Declared, Rig, read_rig
-from nnap_em.em.build import build_system, measure_scales
 from nnap_em.errors import RigError
-from nnap_em.fit.check import Along, CheckResult, check, gramian, torques, undetermined
-from nnap_em.fit.check import _motion as motion
-from nnap_em.fit.check import _observability as observability
-from nnap_em.fit.check import _sampling as sampling
+from nnap_em.estimate.em.build import build_system, measure_scales
+from nnap_em.explain.check import Along, CheckResult, check, gramian, torques, undetermined
+from nnap_em.explain.check import _motion as motion
+from nnap_em.explain.check import _observability as observability
+from nnap_em.explain.check import _sampling as sampling
+from nnap_em.logs.dataset import Dataset
+from nnap_em.logs.read import REPEAT, Logs, Masked
+from nnap_em.machines.rig import Declared, Rig, read_rig
+from nnap_em.machines.systems import specs
+from nnap_em.machines.systems.acrobot import table_i
 from nnap_em.model.simulate import examples, sweep_experiment
-from nnap_em.systems import specs
-from nnap_em.systems.acrobot import table_i
 
 ROWS, COUNT = 201, 6
 

@@ -13,15 +13,15 @@ import pytest
 from helpers import nnap
 from shell import ROOT
 
-from nnap_em.commands import cli
-from nnap_em.commands import identify as identify_command
-from nnap_em.data.rig import read_rig
-from nnap_em.fit.store import load, read
+from nnap_em.base.journal import Journal
+from nnap_em.cli import identify as identify_command
+from nnap_em.cli import main as cli
+from nnap_em.estimate.smoother import AbstractSmoother
+from nnap_em.estimate.smoother.start import StartBank
+from nnap_em.estimate.store import load, read
+from nnap_em.machines.rig import read_rig
+from nnap_em.machines.systems import specs
 from nnap_em.model.simulate import examples
-from nnap_em.smoother import AbstractSmoother
-from nnap_em.smoother.start import StartBank
-from nnap_em.storage.journal import Journal
-from nnap_em.systems import specs
 
 STEPS = 150
 SIMULATE = ("--system", "slide", "--sequences", 4, "--test", 4, "--steps", STEPS, "--seed", 3)
@@ -69,7 +69,7 @@ def fit(bench) -> Path:
 def test_help_shows_examples_and_loads_no_jax():
     code = """
 import sys
-from nnap_em.commands import cli
+from nnap_em.cli import cli
 for command in ("", "simulate", "init", "check", "identify", "diagnose", "compare", "predict", "smooth", "export"):
     try:
         cli.main([command, "--help"] if command else ["--help"])

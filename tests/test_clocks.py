@@ -10,11 +10,11 @@ import pytest
 from helpers import pendulum_rig, read_table
 from recorders import EPOCH, JOINTS, MULTI, NS, TOPICS, arrays, imported, joint_states, ns, ros2, write_hdf5, write_mcap
 
-from nnap_em.data import dates
 from nnap_em.errors import DataError
-from nnap_em.import_ import clock
-from nnap_em.import_.resample import Resampled
-from nnap_em.import_.signals import Signal, sent_on_change
+from nnap_em.logs import dates
+from nnap_em.logs.importing import clock
+from nnap_em.logs.importing.resample import Resampled
+from nnap_em.logs.importing.signals import Signal, sent_on_change
 
 DT = 0.01
 RIG = pendulum_rig() + "[import]\n"

@@ -20,16 +20,17 @@ from helpers import begun, nnap
 from shell import ROOT
 
 from nnap_em import load
-from nnap_em.commands import check, cli, design, diagnose, export, identify, predict, smooth
-from nnap_em.data.logs import read_logs
-from nnap_em.data.rig import read_rig
-from nnap_em.diagnosis.outcome import Diagnosis
-from nnap_em.fit.predict import Prediction
-from nnap_em.fit.store import save
-from nnap_em.systems import specs
+from nnap_em.cli import check, design, diagnose, export, identify, predict, smooth
+from nnap_em.cli import main as cli
+from nnap_em.estimate.predict import Prediction
+from nnap_em.estimate.store import save
+from nnap_em.explain.diagnosis.outcome import Diagnosis
+from nnap_em.logs.read import read_logs
+from nnap_em.machines.rig import read_rig
+from nnap_em.machines.systems import specs
 
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
-LAUNCH = "python -m nnap_em.launch"
+LAUNCH = "python -m nnap_em.cli.launch"
 
 EVERY = "--seed 1 --quiet --trust-readings"
 RUNS: dict[str, tuple[str, ...]] = {

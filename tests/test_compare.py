@@ -15,17 +15,17 @@ from helpers import nnap
 from rigs import slide_logs, slide_rig
 
 from nnap_em import compare
-from nnap_em.comparison.compare import CHANGED, Comparison, corrected, quantity
-from nnap_em.comparison.pooling import LEAST_VARIANCE, apart, joint_test, pool
-from nnap_em.data.rig import Declared
-from nnap_em.diagnosis.hypothesis import Hypothesis
-from nnap_em.effects.base import one
-from nnap_em.effects.friction import LoadFriction
 from nnap_em.errors import CompareError
-from nnap_em.fit.identify import Identified, identify
-from nnap_em.fit.store import load, save
-from nnap_em.report.comparison import describe, rows, table
-from nnap_em.report.tables import plain
+from nnap_em.estimate.identify import Identified, identify
+from nnap_em.estimate.store import load, save
+from nnap_em.explain.compare.compare import CHANGED, Comparison, corrected, quantity
+from nnap_em.explain.compare.pooling import LEAST_VARIANCE, apart, joint_test, pool
+from nnap_em.explain.diagnosis.hypothesis import Hypothesis
+from nnap_em.machines.rig import Declared
+from nnap_em.model.effects.base import one
+from nnap_em.model.effects.friction import LoadFriction
+from nnap_em.output.report.comparison import describe, rows, table
+from nnap_em.output.report.tables import plain
 
 GROWN = 0.25
 """Growth of the Coulomb friction, which is 1 [N]."""

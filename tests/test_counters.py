@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from helpers import pendulum_rig, read_table, swing_rig
 
-from nnap_em.commands import cli
-from nnap_em.data.counters import counter
-from nnap_em.data.formats import write_csv
-from nnap_em.data.logs import read_logs
+from nnap_em.cli import main as cli
 from nnap_em.errors import DataError
+from nnap_em.logs.counters import counter
+from nnap_em.logs.formats import write_csv
+from nnap_em.logs.read import read_logs
 
 T = 0.01 * np.arange(601)
 ANGLE = 1.5 * np.sin(1.1 * T) + 0.4 * np.sin(4.7 * T + 0.4)  # at most 3.2 rad/s

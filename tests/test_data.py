@@ -14,12 +14,12 @@ import scipy.io
 from helpers import csv_text, data_sets, read_table, swing, swing_rig, with_field
 from hypothesis import strategies as st
 
-from nnap_em.data.dataset import Dataset, fill_missing, horizon, pad
-from nnap_em.data.formats import write_csv
-from nnap_em.data.logs import check_split, logs_of_arrays, read_logs, sequences_of
-from nnap_em.data.rig import read_rig
 from nnap_em.errors import DataError
-from nnap_em.systems import specs
+from nnap_em.logs.dataset import Dataset, fill_missing, horizon, pad
+from nnap_em.logs.formats import write_csv
+from nnap_em.logs.read import check_split, logs_of_arrays, read_logs, sequences_of
+from nnap_em.machines.rig import read_rig
+from nnap_em.machines.systems import specs
 
 ROWS, RIG = 201, swing_rig()
 

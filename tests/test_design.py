@@ -12,23 +12,23 @@ from helpers import nnap, written_again
 from rigs import slide_logs, slide_rig
 
 import nnap_em
-from nnap_em.data.dataset import Dataset
-from nnap_em.data.limits import Bounds
-from nnap_em.data.rig import Rig, read_rig, write_rig
 from nnap_em.errors import DesignError, RigError, StoreError
-from nnap_em.experiment.criteria import Criterion, after, share
-from nnap_em.experiment.experiment import design
-from nnap_em.experiment.information import Fit, information, known
-from nnap_em.experiment.limits import Limits, limits_of
-from nnap_em.experiment.play import Motions, allowed, motions
-from nnap_em.experiment.search import Effort
-from nnap_em.experiment.signals import FAMILIES, drawn, mutated, played
-from nnap_em.fit.identify import Identified, identify, parameter_table
-from nnap_em.fit.predict import drawn_paths
-from nnap_em.fit.store import save
+from nnap_em.estimate.identify import Identified, identify, parameter_table
+from nnap_em.estimate.predict import drawn_paths
+from nnap_em.estimate.store import save
+from nnap_em.explain.design.criteria import Criterion, after, share
+from nnap_em.explain.design.experiment import design
+from nnap_em.explain.design.information import Fit, information, known
+from nnap_em.explain.design.limits import Limits, limits_of
+from nnap_em.explain.design.play import Motions, allowed, motions
+from nnap_em.explain.design.search import Effort
+from nnap_em.explain.design.signals import FAMILIES, drawn, mutated, played
+from nnap_em.logs.dataset import Dataset
+from nnap_em.machines.limits import Bounds
+from nnap_em.machines.rig import Rig, read_rig, write_rig
+from nnap_em.machines.systems import specs
 from nnap_em.model.simulate import examples
-from nnap_em.report.design import check_places, write_design
-from nnap_em.systems import specs
+from nnap_em.output.report.design import check_places, write_design
 
 LIMITS = Limits(
     np.asarray([-0.4, 0.1]), np.asarray([0.3, 0.5]), np.asarray([2.0, 1e9]),

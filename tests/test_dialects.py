@@ -16,14 +16,14 @@ from dialects import DT, Q, T, U, V
 from helpers import pendulum_rig
 from recorders import imported, ns, plain_json, write_hdf5, write_mcap
 
-from nnap_em.data import formats
-from nnap_em.data.logs import read_logs
-from nnap_em.data.rig import read_rig
 from nnap_em.errors import DataError, DataWarning
-from nnap_em.import_ import text_file
-from nnap_em.import_.columns import in_unit
-from nnap_em.import_.recording import Address, Topic, last_word, places
-from nnap_em.systems import specs
+from nnap_em.logs import formats
+from nnap_em.logs.importing import text_file
+from nnap_em.logs.importing.columns import in_unit
+from nnap_em.logs.importing.recording import Address, Topic, last_word, places
+from nnap_em.logs.read import read_logs
+from nnap_em.machines.rig import read_rig
+from nnap_em.machines.systems import specs
 
 RIG = pendulum_rig(dt=DT)
 

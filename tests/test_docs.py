@@ -13,10 +13,10 @@ from typing import NamedTuple
 
 import pytest
 
-from nnap_em.commands import cli
-from nnap_em.data.rig import read_rig
-from nnap_em.effects import catalogue
-from nnap_em.systems import register, specs, systems
+from nnap_em.cli import main as cli
+from nnap_em.machines.rig import read_rig
+from nnap_em.machines.systems import register, specs, systems
+from nnap_em.model.effects import catalogue
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]

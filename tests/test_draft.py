@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 from recorders import Q, robot_log
 
-from nnap_em.commands import cli
-from nnap_em.data.formats import write_csv
-from nnap_em.data.logs import read_logs
-from nnap_em.data.rig import read_rig
+from nnap_em.cli import main as cli
 from nnap_em.errors import DataError, RigError
-from nnap_em.init.draft import common_step, draft
-from nnap_em.init.equations import draft_equations
-from nnap_em.init.from_machine import draft_machine
-from nnap_em.systems import specs
+from nnap_em.logs.draft.draft import common_step, draft
+from nnap_em.logs.draft.equations import draft_equations
+from nnap_em.logs.draft.from_machine import draft_machine
+from nnap_em.logs.formats import write_csv
+from nnap_em.logs.read import read_logs
+from nnap_em.machines.rig import read_rig
+from nnap_em.machines.systems import specs
 
 DT, ROWS = 0.02, 400
 NOISE = {"theta1": 2e-3, "theta2": 1e-3, "dtheta1": 0.02, "dtheta2": 0.05, "x": 1e-3, "dx": 5e-3}

@@ -11,11 +11,11 @@ import plant
 import pytest
 from helpers import around, declared_model, rate, slide
 
-from nnap_em.data.dataset import Dataset
-from nnap_em.diagnosis.keys import replaced
-from nnap_em.diagnosis.propose import seeded
-from nnap_em.effects import catalogue, fields, flat
-from nnap_em.effects.function import OVERTONES, PeriodicForce
+from nnap_em.explain.diagnosis.keys import replaced
+from nnap_em.explain.diagnosis.propose import seeded
+from nnap_em.logs.dataset import Dataset
+from nnap_em.model.effects import catalogue, fields, flat
+from nnap_em.model.effects.function import OVERTONES, PeriodicForce
 from nnap_em.model.state_space import with_effects
 
 STEPS, MOTOR = 60, plant.MOTOR_INERTIA
@@ -104,7 +104,7 @@ NOT_COMPARED = {
     **dict.fromkeys(("sensor_bias", "sensor_scale"), "tests/test_planted.py has their readings"),
     **dict.fromkeys(("coulomb_change", "viscous_change", "change"), "tests/test_changed.py changes a machine"),
 }
-OF_EQUATIONS = {name for name, kind in catalogue.items() if kind.__module__ == "nnap_em.effects.equations"}
+OF_EQUATIONS = {name for name, kind in catalogue.items() if kind.__module__ == "nnap_em.model.effects.equations"}
 """Laws of plants without joints; tests/test_equation_laws.py has theirs."""
 
 
@@ -205,7 +205,7 @@ def test_the_vocabulary_is_covered(shared):
     assert set(words) - set(catalogue) == {"asymmetric_friction"}  # a static map: the friction network is its model
     assert set(MAKE) | set(NOT_COMPARED) == set(catalogue) - OF_EQUATIONS
     for name, kind in catalogue.items():
-        if name in OF_EQUATIONS or kind.__module__ == "nnap_em.effects.change":
+        if name in OF_EQUATIONS or kind.__module__ == "nnap_em.model.effects.change":
             continue
         assert kind.key() in words, f"{name}: {kind.key()} is no word of vocabulary.json; name one by `reported_as`"
         assert kind.confirm and kind.__doc__, f"{name} says no way to confirm it, or has no docstring"

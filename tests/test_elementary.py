@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from nnap_em.numerics.elementary import asinh, cos, exp2, reciprocal, sin, sincos
+from nnap_em.base.elementary import asinh, cos, exp2, reciprocal, sin, sincos
 
 
 @pytest.mark.parametrize(

@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from nnap_em.data.dataset import Dataset, stepped
-from nnap_em.data.rig import Rig
-from nnap_em.em.loop import em_step
-from nnap_em.fit.identify import Identified, begin, identify
+from nnap_em.estimate.em.loop import em_step
+from nnap_em.estimate.identify import Identified, begin, identify
+from nnap_em.estimate.smoother.kalman import ekf
+from nnap_em.logs.dataset import Dataset, stepped
+from nnap_em.machines.rig import Rig
 from nnap_em.model.base import prepare
 from nnap_em.model.simulate import Experiment, declared, examples, sweep_experiment
 from nnap_em.model.state_space import StateSpaceModel
-from nnap_em.smoother.kalman import ekf
 
 KEY = jax.random.key(1)
 SPEEDS = np.linspace(-1.5, 1.5, 31)

@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 from helpers import chain_rig, csv_text
 
-from nnap_em.commands.cli import main
-from nnap_em.data.logs import read_logs
-from nnap_em.data.rig import read_rig
-from nnap_em.effects import catalogue
-from nnap_em.export.model import write_model
-from nnap_em.fit.identify import begin
-from nnap_em.fit.store import fingerprint, save
-from nnap_em.systems import specs
+from nnap_em.cli.main import main
+from nnap_em.estimate.identify import begin
+from nnap_em.estimate.store import fingerprint, save
+from nnap_em.logs.read import read_logs
+from nnap_em.machines.rig import read_rig
+from nnap_em.machines.systems import specs
+from nnap_em.model.effects import catalogue
+from nnap_em.output.export.model import write_model
 
 RIG = chain_rig('y = "b + 0.1*u"')
 ROWS, GIVEN, SAMPLES = 60, 6.0, 8

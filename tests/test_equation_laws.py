@@ -12,24 +12,24 @@ import numpy as np
 import pytest
 from helpers import chain_rig
 
-from nnap_em.data.dataset import pad
-from nnap_em.data.rig import read_rig
-from nnap_em.diagnosis import equations
-from nnap_em.diagnosis.equations import FOLDS, Case, by_simulation, folds
-from nnap_em.diagnosis.hypothesis import Evidence, declared
-from nnap_em.diagnosis.search import Progress, search
-from nnap_em.effects import Candidate, OperatingPoint, SensorEffect, catalogue
-from nnap_em.effects.equations import UnknownTerm, lean, numbered
-from nnap_em.em.equations import free_term, motion
-from nnap_em.em.prior import ParameterPrior
-from nnap_em.em.simulated import Simulated, Windows
-from nnap_em.fit.identify import begin, identify
-from nnap_em.init.equations import draft_equations
+from nnap_em.base.deadline import TimeUp
+from nnap_em.estimate.em.equations import free_term, motion
+from nnap_em.estimate.em.prior import ParameterPrior
+from nnap_em.estimate.em.simulated import Simulated, Windows
+from nnap_em.estimate.identify import begin, identify
+from nnap_em.explain.diagnosis import equations
+from nnap_em.explain.diagnosis.equations import FOLDS, Case, by_simulation, folds
+from nnap_em.explain.diagnosis.hypothesis import Evidence, declared
+from nnap_em.explain.diagnosis.search import Progress, search
+from nnap_em.logs.dataset import pad
+from nnap_em.logs.draft.equations import draft_equations
+from nnap_em.machines.rig import read_rig
+from nnap_em.machines.systems import Equations, specs
+from nnap_em.model.effects import Candidate, OperatingPoint, SensorEffect, catalogue
+from nnap_em.model.effects.equations import UnknownTerm, lean, numbered
 from nnap_em.model.state_space import Inputs
-from nnap_em.report.document import unknown_terms as reported_terms
-from nnap_em.report.fit_plots import term_figure
-from nnap_em.storage.deadline import TimeUp
-from nnap_em.systems import Equations, specs
+from nnap_em.output.report.document import unknown_terms as reported_terms
+from nnap_em.output.report.fit_plots import term_figure
 
 PLANT = {
     "states": {"a": "m", "b": "m"}, "inputs": {"u": "V"}, "rates": {"a": "u - a", "b": "k*a - b"}, "readings": {},

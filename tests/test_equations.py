@@ -15,21 +15,21 @@ import scipy.linalg
 import scipy.signal
 from helpers import written_again
 
-from nnap_em.data.dataset import Dataset, pad
-from nnap_em.data.logs import read_logs
-from nnap_em.data.rig import read_rig
-from nnap_em.effects import catalogue
-from nnap_em.em import simulated
-from nnap_em.em.build import build_system
-from nnap_em.em.equations import Motion, _modes, motion, pace_of
 from nnap_em.errors import FormulaError, RigError
-from nnap_em.fit import identify as identification
-from nnap_em.fit.check import check
-from nnap_em.fit.identify import begin, identify, parameter_table
-from nnap_em.fit.store import load, save
+from nnap_em.estimate import identify as identification
+from nnap_em.estimate.em import simulated
+from nnap_em.estimate.em.build import build_system
+from nnap_em.estimate.em.equations import Motion, _modes, motion, pace_of
+from nnap_em.estimate.identify import begin, identify, parameter_table
+from nnap_em.estimate.store import load, save
+from nnap_em.explain.check import check
+from nnap_em.logs.dataset import Dataset, pad
+from nnap_em.logs.read import read_logs
+from nnap_em.machines.rig import read_rig
+from nnap_em.machines.systems import register_equations, specs
+from nnap_em.machines.systems.expression import parse
+from nnap_em.model.effects import catalogue
 from nnap_em.model.hooks import Sampling, late
-from nnap_em.systems import register_equations, specs
-from nnap_em.systems.expression import parse
 
 HEAD = 'format = 1\nname = "r"\n'
 TAIL = '[sampling]\ndt = 0.5\ninput_hold = "zero-order"\nclock = "sequence"\n'

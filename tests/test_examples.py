@@ -11,8 +11,8 @@ import tanks
 from helpers import optimised
 
 import nnap_em
-from nnap_em.experiment.search import Effort
-from nnap_em.storage.journal import Journal, keeping
+from nnap_em.base.journal import Journal, keeping
+from nnap_em.explain.design.search import Effort
 
 TOUR = Path(__file__).resolve().parents[1] / "examples" / "tour.py"
 

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from helpers import nnap
 
-from nnap_em.effects import catalogue
-from nnap_em.export.model import parameters
-from nnap_em.fit.identify import friction_table, parameter_table
-from nnap_em.fit.store import save
+from nnap_em.estimate.identify import friction_table, parameter_table
+from nnap_em.estimate.store import save
+from nnap_em.model.effects import catalogue
 from nnap_em.model.state_space import with_effects
+from nnap_em.output.export.model import parameters
 
 
 def test_the_command_writes_the_numbers_of_the_model(slide_fit, tmp_path, capsys):

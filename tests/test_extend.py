@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from rigs import slide_logs
 
-from nnap_em.diagnosis.context import SearchContext, extend
-from nnap_em.diagnosis.hypothesis import Hypothesis
+from nnap_em.explain.diagnosis.context import SearchContext, extend
+from nnap_em.explain.diagnosis.hypothesis import Hypothesis
 
 
 def test_friction_that_is_right_is_gone_on_from(slide_fit):

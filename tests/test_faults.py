@@ -25,16 +25,16 @@ import pytest
 from helpers import begun
 from shell import ENVIRONMENT
 
-from nnap_em.commands import cli
-from nnap_em.commands import identify as identify_command
-from nnap_em.commands.identify import MISFIT_STATUS
-from nnap_em.data.logs import read_logs
-from nnap_em.data.rig import read_rig
-from nnap_em.effects import catalogue
-from nnap_em.numerics.digest import digest
-from nnap_em.storage import files, journal
-from nnap_em.storage.journal import HERE, Journal, keeping, step
-from nnap_em.systems import specs
+from nnap_em.base import files, journal
+from nnap_em.base.digest import digest
+from nnap_em.base.journal import HERE, Journal, keeping, step
+from nnap_em.cli import identify as identify_command
+from nnap_em.cli import main as cli
+from nnap_em.cli.identify import MISFIT_STATUS
+from nnap_em.logs.read import read_logs
+from nnap_em.machines.rig import read_rig
+from nnap_em.machines.systems import specs
+from nnap_em.model.effects import catalogue
 
 SPRING = {"name": "torsional_spring", "joint": 1, "k": 20.0, "theta0": 0.05}
 SLIDE = plant.Case(system="slide", sequences=8, tests=1, steps=95, seed=2, noise=(5e-4, 5e-3), effects=(SPRING,))
@@ -214,7 +214,7 @@ def _steps(out: Path) -> list[int]:
 
 def _diagnosed(rig: Path, out: Path, *more: str, kind: signal.Signals | None = None, count: int = 0) -> tuple[int, str]:
     """Exit status and stderr of a search in its own process, which gets a signal after `count` new finished steps."""
-    program = [sys.executable, "-m", "nnap_em.commands.cli", *_order("diagnose", rig, out, *more)]
+    program = [sys.executable, "-m", "nnap_em.cli.main", *_order("diagnose", rig, out, *more)]
     run = subprocess.Popen(program, env=ENVIRONMENT, stderr=subprocess.PIPE, text=True)
     before = _steps(out)
     while kind and run.poll() is None and count:

@@ -7,15 +7,15 @@ import jax.numpy as jnp
 import numpy as np
 import plant
 
-from nnap_em.data.dataset import Dataset
-from nnap_em.data.rig import Declared, Rig
-from nnap_em.diagnosis.findings import advice, entry, findings, suspected, undecided, verdict
-from nnap_em.diagnosis.hypothesis import Evidence, Hypothesis
-from nnap_em.diagnosis.keys import key_of
-from nnap_em.diagnosis.outcome import Diagnosis, Step, Suspect
-from nnap_em.effects import AbstractEffect, Candidate, catalogue
-from nnap_em.effects.function import Axis
-from nnap_em.fit.identify import Identified, begin
+from nnap_em.estimate.identify import Identified, begin
+from nnap_em.explain.diagnosis.findings import advice, entry, findings, suspected, undecided, verdict
+from nnap_em.explain.diagnosis.hypothesis import Evidence, Hypothesis
+from nnap_em.explain.diagnosis.keys import key_of
+from nnap_em.explain.diagnosis.outcome import Diagnosis, Step, Suspect
+from nnap_em.logs.dataset import Dataset
+from nnap_em.machines.rig import Declared, Rig
+from nnap_em.model.effects import AbstractEffect, Candidate, catalogue
+from nnap_em.model.effects.function import Axis
 
 ROWS = 60
 BODY = {name: Declared(value, 0.0) for name, value in plant.SYSTEMS["acrobot"].parameters.items()}

@@ -10,17 +10,17 @@ import numpy as np
 import pytest
 from helpers import slide
 
-from nnap_em.data.dataset import Dataset
-from nnap_em.diagnosis import refit as refits
-from nnap_em.em import loop, multistep, stated
-from nnap_em.em.loop import EMState, Schedule
-from nnap_em.em.mstep import MStepInfo, ScoringMStep
-from nnap_em.em.multistep import Followed, Linear, OpenLoop
-from nnap_em.fit import identify
-from nnap_em.fit.identify import Identified
-from nnap_em.numerics.gaussian import Gaussian
-from nnap_em.smoother.gaussian import CubatureSmoother
-from nnap_em.smoother.start import StartBank
+from nnap_em.base.gaussian import Gaussian
+from nnap_em.estimate import identify
+from nnap_em.estimate.em import loop, multistep, stated
+from nnap_em.estimate.em.loop import EMState, Schedule
+from nnap_em.estimate.em.mstep import MStepInfo, ScoringMStep
+from nnap_em.estimate.em.multistep import Followed, Linear, OpenLoop
+from nnap_em.estimate.identify import Identified
+from nnap_em.estimate.smoother.gaussian import CubatureSmoother
+from nnap_em.estimate.smoother.start import StartBank
+from nnap_em.explain.diagnosis import refit as refits
+from nnap_em.logs.dataset import Dataset
 
 MODEL, RULE = slide()
 DATA = Dataset(*(np.zeros((4, 9, *shape)) for shape in ((), (1,), (2,))), np.ones((4, 9), bool))

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from helpers import swing, swing_rig
 
-from nnap_em.data.formats import write_csv
-from nnap_em.data.held import HELD_ROWS, hold, repeats
-from nnap_em.data.logs import read_logs
-from nnap_em.data.rough import rough
 from nnap_em.errors import DataWarning
+from nnap_em.logs.formats import write_csv
+from nnap_em.logs.held import HELD_ROWS, hold, repeats
+from nnap_em.logs.read import read_logs
+from nnap_em.logs.rough import rough
 
 T = 0.01 * np.arange(601)
 ANGLE = np.sin(2.2 * T) + 0.3 * np.sin(9.1 * T + 0.4)

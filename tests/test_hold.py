@@ -10,15 +10,15 @@ import pytest
 from helpers import rig_text, slide
 from scipy.signal import lsim
 
-from nnap_em.data.dataset import Dataset, pad
-from nnap_em.data.rig import HOLD, SMOOTH, read_rig
-from nnap_em.effects import catalogue
-from nnap_em.em.build import build_system
-from nnap_em.fit.check import late
-from nnap_em.fit.inverse_dynamics import lag, regression
+from nnap_em.estimate.em.build import build_system
+from nnap_em.explain.check import late
+from nnap_em.explain.inverse_dynamics import lag, regression
+from nnap_em.logs.dataset import Dataset, pad
+from nnap_em.machines.rig import HOLD, SMOOTH, read_rig
+from nnap_em.machines.systems import specs
 from nnap_em.model import hooks
+from nnap_em.model.effects import catalogue
 from nnap_em.model.state_space import with_effects
-from nnap_em.systems import specs
 
 DT, ROWS = 0.05, 40
 LINES = hooks.Sampling(DT, smooth=True)

@@ -10,11 +10,11 @@ import pytest
 from helpers import nnap, pendulum_rig, read_table
 from recorders import JOINTS, MULTI, TOPICS, arrays, joint_states, ns, plain_json, ros2, write_mcap
 
-from nnap_em.data.logs import read_logs
-from nnap_em.data.machine import unpacked
-from nnap_em.data.rig import read_rig
-from nnap_em.import_.signals import Signal, averaged, held, interpolated
-from nnap_em.systems import specs
+from nnap_em.logs.importing.signals import Signal, averaged, held, interpolated
+from nnap_em.logs.read import read_logs
+from nnap_em.machines.machine import unpacked
+from nnap_em.machines.rig import read_rig
+from nnap_em.machines.systems import specs
 
 DT = 0.01
 T = DT * np.arange(300)

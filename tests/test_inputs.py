@@ -8,19 +8,19 @@ import numpy as np
 import plant
 import pytest
 
-from nnap_em.data.dataset import Dataset
-from nnap_em.data.rig import Declared, Rig
-from nnap_em.diagnosis.hypothesis import Hypothesis
-from nnap_em.diagnosis.keys import completed, complexity, contains, remainder_of
-from nnap_em.diagnosis.propose import proposals, surroundings
-from nnap_em.diagnosis.screen import screen
-from nnap_em.diagnosis.smoothed import SmoothedFit
-from nnap_em.effects import catalogue, free_form
-from nnap_em.effects.base import OperatingPoint
-from nnap_em.effects.function import Axis, UnknownFunction
-from nnap_em.em.build import build
+from nnap_em.base.gaussian import Gaussian
+from nnap_em.estimate.em.build import build
+from nnap_em.explain.diagnosis.hypothesis import Hypothesis
+from nnap_em.explain.diagnosis.keys import completed, complexity, contains, remainder_of
+from nnap_em.explain.diagnosis.propose import proposals, surroundings
+from nnap_em.explain.diagnosis.screen import screen
+from nnap_em.explain.diagnosis.smoothed import SmoothedFit
+from nnap_em.logs.dataset import Dataset
+from nnap_em.machines.rig import Declared, Rig
+from nnap_em.model.effects import catalogue, free_form
+from nnap_em.model.effects.base import OperatingPoint
+from nnap_em.model.effects.function import Axis, UnknownFunction
 from nnap_em.model.state_space import Inputs, with_effects
-from nnap_em.numerics.gaussian import Gaussian
 
 STATES = ("theta1", "theta2", "dtheta1", "dtheta2")
 RIG = Rig(

@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from nnap_em.diagnosis.interventions import Intervention, disturbances
-from nnap_em.diagnosis.residual import Names, Residual
-from nnap_em.report.diagnosis import _disturbance
-from nnap_em.report.page import page
+from nnap_em.explain.diagnosis.interventions import Intervention, disturbances
+from nnap_em.explain.diagnosis.residual import Names, Residual
+from nnap_em.output.report.diagnosis import _disturbance
+from nnap_em.output.report.page import page
 
 DT = 0.01
 NAMES = Names(("x",), ("dx",), (False,), ("u",), (1,), ("x", "dx"))

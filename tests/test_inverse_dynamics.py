@@ -8,11 +8,11 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from nnap_em.data.dataset import Dataset
-from nnap_em.data.rig import Declared, Rig
-from nnap_em.em.build import build_system
-from nnap_em.fit.check import dynamics
-from nnap_em.fit.inverse_dynamics import LARGEST_REMAINDER, SMALLEST_MISFIT, Explanation, mistakes, regression
+from nnap_em.estimate.em.build import build_system
+from nnap_em.explain.check import dynamics
+from nnap_em.explain.inverse_dynamics import LARGEST_REMAINDER, SMALLEST_MISFIT, Explanation, mistakes, regression
+from nnap_em.logs.dataset import Dataset
+from nnap_em.machines.rig import Declared, Rig
 
 Log = tuple[Rig, Dataset]
 SEQUENCES, ROWS, DT = 2, 401, 0.01

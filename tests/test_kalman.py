@@ -12,13 +12,13 @@ import pytest
 from scipy.linalg import block_diag
 from statsmodels.tsa.statespace.kalman_smoother import KalmanSmoother
 
-from nnap_em.data.dataset import Dataset
-from nnap_em.em.loop import e_step
+from nnap_em.base.gaussian import Gaussian
+from nnap_em.estimate.em.loop import e_step
+from nnap_em.estimate.smoother.gaussian import CubatureSmoother, GaussianSmoother
+from nnap_em.estimate.smoother.kalman import Affine, Cubature, Reading, Tangent, kalman_filter, rts
+from nnap_em.estimate.smoother.start import StartBank
+from nnap_em.logs.dataset import Dataset
 from nnap_em.model.base import AbstractModel, Prepared, prepare
-from nnap_em.numerics.gaussian import Gaussian
-from nnap_em.smoother.gaussian import CubatureSmoother, GaussianSmoother
-from nnap_em.smoother.kalman import Affine, Cubature, Reading, Tangent, kalman_filter, rts
-from nnap_em.smoother.start import StartBank
 
 LOG_2PI = np.log(2 * np.pi)
 

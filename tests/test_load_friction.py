@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 import rod
 
-from nnap_em.effects import SearchScales, fields
-from nnap_em.effects.base import a
-from nnap_em.effects.friction import LoadFriction
-from nnap_em.fit.identify import begin
+from nnap_em.estimate.identify import begin
+from nnap_em.model.effects import SearchScales, fields
+from nnap_em.model.effects.base import a
+from nnap_em.model.effects.friction import LoadFriction
 from nnap_em.model.state_space import Inputs, StateSpaceModel
 
 KNEE = 0.1

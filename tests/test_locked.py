@@ -12,14 +12,14 @@ import pytest
 from helpers import file_rig, written_again
 from machines import arm
 
-from nnap_em.data.dataset import Dataset
-from nnap_em.data.rig import read_rig
-from nnap_em.em.build import build_system
 from nnap_em.errors import MachineError, RigError
-from nnap_em.export.mjcf import write_mjcf
-from nnap_em.fit.identify import begin
-from nnap_em.machines.mjcf import Part, read_machine
-from nnap_em.systems import specs
+from nnap_em.estimate.em.build import build_system
+from nnap_em.estimate.identify import begin
+from nnap_em.logs.dataset import Dataset
+from nnap_em.machines.files.mjcf import Part, read_machine
+from nnap_em.machines.rig import read_rig
+from nnap_em.machines.systems import specs
+from nnap_em.output.export.mjcf import write_mjcf
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -70,7 +70,7 @@ CASES = {  # name: (machine, what is held, joints that are held besides)
 }  # fmt: skip
 
 
-@pytest.mark.filterwarnings("ignore:.*are left out, as friction is learned:nnap_em.data.rig.RigWarning")
+@pytest.mark.filterwarnings("ignore:.*are left out, as friction is learned:nnap_em.machines.rig.RigWarning")
 @pytest.mark.parametrize(("machine", "line", "held"), CASES.values(), ids=CASES)
 def test_mass_and_bias_are_those_of_the_whole_with_joints_held(machine, line, held, tmp_path):
     model, held = mujoco.MjModel.from_xml_string(machine), tomllib.loads(line)["locked"] | held
@@ -118,7 +118,7 @@ BAD = {
 }
 
 
-@pytest.mark.filterwarnings("ignore::nnap_em.data.rig.RigWarning")
+@pytest.mark.filterwarnings("ignore::nnap_em.machines.rig.RigWarning")
 @pytest.mark.parametrize(("machine", "line", "said"), BAD.values(), ids=BAD)
 def test_what_cannot_be_held_is_refused_with_the_line_to_add(machine, line, said, tmp_path):
     with pytest.raises(RigError, match=said):

@@ -11,9 +11,9 @@ from helpers import compiled, nnap
 from rigs import slide_logs, slide_rig
 
 from nnap_em import diagnose, findings
-from nnap_em.diagnosis.findings import Finding, verdict
-from nnap_em.effects import catalogue
-from nnap_em.effects.position import TorsionalSpring
+from nnap_em.explain.diagnosis.findings import Finding, verdict
+from nnap_em.model.effects import catalogue
+from nnap_em.model.effects.position import TorsionalSpring
 
 SPRING = TorsionalSpring.of(20.0, 1.0, 0.0, 0.0, joint=1)
 HELD = {"name": "torsional_spring", "joint": 1, "k": 20.0, "theta0": 0.05}

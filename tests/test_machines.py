@@ -13,16 +13,16 @@ import pytest
 from helpers import file_rig, written_again
 from machines import arm, tree
 
-from nnap_em.data.machine import packed, unpacked
-from nnap_em.data.rig import Declared, read_rig
-from nnap_em.effects import catalogue
-from nnap_em.em.build import build_system
+from nnap_em.base.gaussian import spd_solve
 from nnap_em.errors import RigError, RigWarning
-from nnap_em.fit.identifiability import identifiability
-from nnap_em.init.from_machine import draft_machine
-from nnap_em.machines.mjcf import read_machine
-from nnap_em.numerics.gaussian import spd_solve
-from nnap_em.systems import specs
+from nnap_em.estimate.em.build import build_system
+from nnap_em.estimate.identifiability import identifiability
+from nnap_em.logs.draft.from_machine import draft_machine
+from nnap_em.machines.files.mjcf import read_machine
+from nnap_em.machines.machine import packed, unpacked
+from nnap_em.machines.rig import Declared, read_rig
+from nnap_em.machines.systems import specs
+from nnap_em.model.effects import catalogue
 
 ROOT = Path(__file__).resolve().parents[1]
 MACHINES = ROOT / "tests" / "machines"

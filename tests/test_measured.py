@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from helpers import data_sets
 
-from nnap_em.data.logs import read_logs
-from nnap_em.data.rig import read_rig
-from nnap_em.em.build import build
-from nnap_em.em.loop import e_step, em_step
-from nnap_em.smoother.gaussian import CubatureSmoother
-from nnap_em.systems import specs
+from nnap_em.estimate.em.build import build
+from nnap_em.estimate.em.loop import e_step, em_step
+from nnap_em.estimate.smoother.gaussian import CubatureSmoother
+from nnap_em.logs.read import read_logs
+from nnap_em.machines.rig import read_rig
+from nnap_em.machines.systems import specs
 
 
 def _problem(folder: Path):

@@ -8,14 +8,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from nnap_em.data.dataset import Dataset
-from nnap_em.data.rig import Declared, Rig
-from nnap_em.em.build import measure_scales
-from nnap_em.fit import misfit as bounds
-from nnap_em.fit.identify import Identified, begin
-from nnap_em.fit.misfit import Accuracy, ahead, misfit, moved, simulating
-from nnap_em.fit.store import load, save
-from nnap_em.report import identification
+from nnap_em.estimate import misfit as bounds
+from nnap_em.estimate.em.build import measure_scales
+from nnap_em.estimate.identify import Identified, begin
+from nnap_em.estimate.misfit import Accuracy, ahead, misfit, moved, simulating
+from nnap_em.estimate.store import load, save
+from nnap_em.logs.dataset import Dataset
+from nnap_em.machines.rig import Declared, Rig
+from nnap_em.output.report import identification
 
 DT, ROWS = 0.02, 201
 RIG = Rig("slide", "slide", {"m": Declared(1.0, 0.1)}, False, ("u",), (1,), DT, "sequence", ("x",), {"x": 0.01}, {})

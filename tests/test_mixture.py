@@ -5,14 +5,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from nnap_em.data.dataset import Dataset
-from nnap_em.em.loop import _replaced, e_step
+from nnap_em.base.gaussian import Gaussian
+from nnap_em.estimate.em.loop import _replaced, e_step
+from nnap_em.estimate.smoother.gaussian import CubatureSmoother
+from nnap_em.estimate.smoother.kalman import Affine, Filtered, Reading
+from nnap_em.estimate.smoother.mixture import WIDE_STD, Components, Tree, branch, merged, split
+from nnap_em.estimate.smoother.start import StartBank
+from nnap_em.logs.dataset import Dataset
 from nnap_em.model.base import AbstractModel
-from nnap_em.numerics.gaussian import Gaussian
-from nnap_em.smoother.gaussian import CubatureSmoother
-from nnap_em.smoother.kalman import Affine, Filtered, Reading
-from nnap_em.smoother.mixture import WIDE_STD, Components, Tree, branch, merged, split
-from nnap_em.smoother.start import StartBank
 
 ROWS = 60
 KEY = jax.random.key(0)

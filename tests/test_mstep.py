@@ -8,23 +8,23 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from nnap_em.data.dataset import Dataset, active_steps
-from nnap_em.em.mstep import ScoringMStep
-from nnap_em.em.prior import ParameterPrior
-from nnap_em.em.quadratic import Quadratic, local, locals_along, quadratic, readings_at
-from nnap_em.em.weights import AT_REST, COULOMB, VISCOUS, Weights
+from nnap_em.base.gaussian import Gaussian
+from nnap_em.base.parallel import each
+from nnap_em.estimate.em.mstep import ScoringMStep
+from nnap_em.estimate.em.prior import ParameterPrior
+from nnap_em.estimate.em.quadratic import Quadratic, local, locals_along, quadratic, readings_at
+from nnap_em.estimate.em.weights import AT_REST, COULOMB, VISCOUS, Weights
+from nnap_em.estimate.smoother.gaussian import ExtendedKalmanSmoother
+from nnap_em.estimate.smoother.kalman import Tangent, kalman_filter, linear_reading
+from nnap_em.estimate.smoother.posterior import Posterior
+from nnap_em.estimate.smoother.start import StartBank
+from nnap_em.logs.dataset import Dataset, active_steps
+from nnap_em.machines.systems.slide import Slide
 from nnap_em.model.base import prepare
 from nnap_em.model.friction import FixedFriction, FrictionNetwork, NoFriction
 from nnap_em.model.law import StribeckLaw
 from nnap_em.model.simulate import simulate
 from nnap_em.model.state_space import Inputs, StateSpaceModel
-from nnap_em.numerics.gaussian import Gaussian
-from nnap_em.numerics.parallel import each
-from nnap_em.smoother.gaussian import ExtendedKalmanSmoother
-from nnap_em.smoother.kalman import Tangent, kalman_filter, linear_reading
-from nnap_em.smoother.posterior import Posterior
-from nnap_em.smoother.start import StartBank
-from nnap_em.systems.slide import Slide
 
 DT = 0.05
 NODES = jnp.asarray([[-8.0, -2.0, 0.5, 3.0, 9.0]])  # beyond all speeds, so that the nodes interpolate v exactly

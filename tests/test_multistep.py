@@ -8,15 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from nnap_em.data.dataset import Dataset
-from nnap_em.diagnosis.columns import candidate_columns, tracks
-from nnap_em.diagnosis.hypothesis import Hypothesis
-from nnap_em.diagnosis.propose import surroundings
-from nnap_em.diagnosis.smoothed import SmoothedFit
-from nnap_em.effects import Candidate, catalogue
-from nnap_em.em import multistep
-from nnap_em.em.build import build
-from nnap_em.em.multistep import (
+from nnap_em.base.gaussian import Gaussian
+from nnap_em.estimate.em import multistep
+from nnap_em.estimate.em.build import build
+from nnap_em.estimate.em.multistep import (
     OpenLoop,
     errors,
     finish,
@@ -28,15 +23,20 @@ from nnap_em.em.multistep import (
     robust_scale,
     weighed,
 )
-from nnap_em.em.prior import ParameterPrior
-from nnap_em.em.quadratic import local
-from nnap_em.em.readings import third_differences, white_readings
-from nnap_em.em.weights import friction_prior
+from nnap_em.estimate.em.prior import ParameterPrior
+from nnap_em.estimate.em.quadratic import local
+from nnap_em.estimate.em.readings import third_differences, white_readings
+from nnap_em.estimate.em.weights import friction_prior
+from nnap_em.estimate.smoother.kalman import CUBATURE
+from nnap_em.explain.diagnosis.columns import candidate_columns, tracks
+from nnap_em.explain.diagnosis.hypothesis import Hypothesis
+from nnap_em.explain.diagnosis.propose import surroundings
+from nnap_em.explain.diagnosis.smoothed import SmoothedFit
+from nnap_em.logs.dataset import Dataset
 from nnap_em.model.base import prepare
+from nnap_em.model.effects import Candidate, catalogue
 from nnap_em.model.simulate import declared, examples, paper_model
 from nnap_em.model.state_space import with_effects
-from nnap_em.numerics.gaussian import Gaussian
-from nnap_em.smoother.kalman import CUBATURE
 
 ROWS = 60
 TRUTH = replace(examples["pendulum"]().model, measured=(0, 1), log_r=jnp.log(jnp.asarray([1e-8, 1e-4])))

@@ -7,19 +7,10 @@ import pytest
 import scipy.stats
 from jax.extend.random import threefry_2x32
 
-from nnap_em.numerics.gaussian import (
-    MOST_UNROLLED,
-    Gaussian,
-    cholesky,
-    lower,
-    product,
-    spd_solve,
-    symmetric,
-    upper_solve,
-)
-from nnap_em.numerics.random import normals, threefry
-from nnap_em.numerics.rows import ROWS_AT_ONCE, rows
-from nnap_em.smoother.particle.filter import cumsum
+from nnap_em.base.gaussian import MOST_UNROLLED, Gaussian, cholesky, lower, product, spd_solve, symmetric, upper_solve
+from nnap_em.base.random import normals, threefry
+from nnap_em.base.rows import ROWS_AT_ONCE, rows
+from nnap_em.estimate.smoother.particle.filter import cumsum
 
 EPS = np.finfo(float).eps
 

@@ -8,20 +8,29 @@ import numpy as np
 import pytest
 from helpers import file_rig, slide
 
-from nnap_em.data.dataset import Dataset
-from nnap_em.data.rig import read_rig
-from nnap_em.effects import catalogue
-from nnap_em.fit import observer as observing
-from nnap_em.fit.identify import begin
-from nnap_em.fit.observer import AMBIGUOUS, MISSING, NO_INPUT, OUTLIER, RESTARTED, functions, observer, restart_prior
+from nnap_em.estimate import observer as observing
+from nnap_em.estimate.identify import begin
+from nnap_em.estimate.observer import (
+    AMBIGUOUS,
+    MISSING,
+    NO_INPUT,
+    OUTLIER,
+    RESTARTED,
+    functions,
+    observer,
+    restart_prior,
+)
+from nnap_em.estimate.smoother.kalman import CUBATURE, ekf
+from nnap_em.estimate.smoother.mixture import alone, mixture_filter
+from nnap_em.logs.dataset import Dataset
+from nnap_em.machines.rig import read_rig
+from nnap_em.machines.systems import specs
 from nnap_em.model.base import prepare
+from nnap_em.model.effects import catalogue
 from nnap_em.model.friction import FrictionNetwork
 from nnap_em.model.servo import Servo
 from nnap_em.model.simulate import paper_experiment, paper_model
 from nnap_em.model.state_space import with_effects
-from nnap_em.smoother.kalman import CUBATURE, ekf
-from nnap_em.smoother.mixture import alone, mixture_filter
-from nnap_em.systems import specs
 
 NUMBER = lambda x: jnp.asarray(x, float)  # noqa: E731
 ROWS = 120

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from nnap_em.numerics.ode import integrate
+from nnap_em.base.ode import integrate
 
 X0 = jnp.asarray([1.2, -0.7])
 

@@ -9,18 +9,18 @@ import numpy as np
 import pytest
 from observer_c import SANITIZED, held, paper_rig, play, replay, rough, wild
 
-from nnap_em.commands import cli
-from nnap_em.data.dataset import Dataset
-from nnap_em.data.rig import Declared, Rig
-from nnap_em.effects import catalogue
+from nnap_em.cli import main as cli
 from nnap_em.errors import ExportError
-from nnap_em.export.online import write_observer
-from nnap_em.fit.identify import begin
-from nnap_em.fit.observer import AMBIGUOUS, MISSING, OUTLIER, observer
-from nnap_em.fit.store import save
+from nnap_em.estimate.identify import begin
+from nnap_em.estimate.observer import AMBIGUOUS, MISSING, OUTLIER, observer
+from nnap_em.estimate.store import save
+from nnap_em.logs.dataset import Dataset
+from nnap_em.machines.rig import Declared, Rig
+from nnap_em.model.effects import catalogue
 from nnap_em.model.servo import Servo
 from nnap_em.model.simulate import paper_experiment, paper_model
 from nnap_em.model.state_space import with_effects
+from nnap_em.output.export.online import write_observer
 
 DT = 0.02
 PENDULUM = Rig(

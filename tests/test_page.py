@@ -7,14 +7,14 @@ import pytest
 from helpers import begun
 from rigs import slide_logs, slide_rig
 
-from nnap_em.data.logs import logs_of_arrays
-from nnap_em.diagnosis.statistics import FAILS
-from nnap_em.effects import catalogue
-from nnap_em.numerics.digits import counted, number, with_std
-from nnap_em.report.document import predictions
-from nnap_em.report.html import Picture
-from nnap_em.report.page import page
-from nnap_em.report.wording import p_value, reached
+from nnap_em.base.digits import counted, number, with_std
+from nnap_em.explain.diagnosis.statistics import FAILS
+from nnap_em.logs.read import logs_of_arrays
+from nnap_em.model.effects import catalogue
+from nnap_em.output.report.document import predictions
+from nnap_em.output.report.html import Picture
+from nnap_em.output.report.page import page
+from nnap_em.output.report.wording import p_value, reached
 
 SVG = b'<?xml version="1.0"?>\n<svg width="360pt" height="200pt" xmlns="http://www.w3.org/2000/svg"></svg>'
 VOID = {"meta", "img", "input"}

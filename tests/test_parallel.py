@@ -17,8 +17,8 @@ import pytest
 from helpers import nnap
 from shell import ENVIRONMENT
 
-from nnap_em.launch import free_address
-from nnap_em.numerics.parallel import all_devices, each, over
+from nnap_em.base.parallel import all_devices, each, over
+from nnap_em.cli.launch import free_address
 
 
 def _weigh(common, one):
@@ -52,7 +52,7 @@ def rig(tmp_path_factory) -> Path:
 @contextlib.contextmanager
 def _launched(*order: object, env: dict[str, str] = ENVIRONMENT, own: bool = False) -> Iterator[subprocess.Popen]:
     """Processes of a command, which end at the end; `own`: they are a group that signals are sent to."""
-    argv, piped = [sys.executable, "-m", "nnap_em.launch", *map(str, order)], subprocess.PIPE
+    argv, piped = [sys.executable, "-m", "nnap_em.cli.launch", *map(str, order)], subprocess.PIPE
     run = subprocess.Popen(argv, env=env, start_new_session=own, stdout=subprocess.DEVNULL, stderr=piped, text=True)
     try:
         yield run
@@ -86,8 +86,8 @@ TOY = """
 import sys, time
 if "--work" in sys.argv:  # not in the process that starts the others
     import numpy as np
-    from nnap_em.commands import identify as command
-    from nnap_em.storage.journal import HERE, step
+    from nnap_em.cli import identify as command
+    from nnap_em.base.journal import HERE, step
     @step(lambda *_: HERE)
     def toy(i):
         time.sleep(0.05)

@@ -10,12 +10,10 @@ import pytest
 import scipy.stats
 from jaxtyping import Array, Float
 
-from nnap_em.data.dataset import Dataset, fill_missing, stepped
-from nnap_em.model.base import AbstractModel, prepare
-from nnap_em.numerics.gaussian import Gaussian
-from nnap_em.smoother.gaussian import ExtendedKalmanSmoother
-from nnap_em.smoother.kalman import Reading, Tangent, kalman_filter
-from nnap_em.smoother.particle import (
+from nnap_em.base.gaussian import Gaussian
+from nnap_em.estimate.smoother.gaussian import ExtendedKalmanSmoother
+from nnap_em.estimate.smoother.kalman import Reading, Tangent, kalman_filter
+from nnap_em.estimate.smoother.particle import (
     Bootstrap,
     ExactBackward,
     Guided,
@@ -25,8 +23,10 @@ from nnap_em.smoother.particle import (
     ffbs,
     particle_filter,
 )
-from nnap_em.smoother.particle.filter import systematic
-from nnap_em.smoother.start import StartBank
+from nnap_em.estimate.smoother.particle.filter import systematic
+from nnap_em.estimate.smoother.start import StartBank
+from nnap_em.logs.dataset import Dataset, fill_missing, stepped
+from nnap_em.model.base import AbstractModel, prepare
 
 PROPOSALS = {"bootstrap": Bootstrap(), "guided": Guided(), "lookahead": Lookahead(1.0)}
 SEEDS, PARTICLES, PATHS = 100, 200, 40

@@ -11,19 +11,19 @@ from helpers import rate
 from planted_cases import CONTROLS, LAWS, PLANTED, REST, Motion, Plant, case_of
 from planted_table import score, table
 
-from nnap_em.data.logs import check_split, read_logs
-from nnap_em.data.rig import read_rig
-from nnap_em.effects import AbstractEffect
-from nnap_em.effects.actuator import DeadZone, MotorGain, OneSidedLoss
-from nnap_em.effects.base import a
-from nnap_em.effects.friction import AirDrag, LoadFriction, PositionDependentFriction
-from nnap_em.effects.mounting import BaseVibration
-from nnap_em.effects.position import Cogging, EddyBrake, TorsionalSpring
-from nnap_em.effects.sensor import SensorBias, SensorScale
+from nnap_em.base.gaussian import Gaussian
+from nnap_em.logs.read import check_split, read_logs
+from nnap_em.machines.rig import read_rig
+from nnap_em.machines.systems import specs
+from nnap_em.machines.systems.arm import TwoLinkArm
+from nnap_em.model.effects import AbstractEffect
+from nnap_em.model.effects.actuator import DeadZone, MotorGain, OneSidedLoss
+from nnap_em.model.effects.base import a
+from nnap_em.model.effects.friction import AirDrag, LoadFriction, PositionDependentFriction
+from nnap_em.model.effects.mounting import BaseVibration
+from nnap_em.model.effects.position import Cogging, EddyBrake, TorsionalSpring
+from nnap_em.model.effects.sensor import SensorBias, SensorScale
 from nnap_em.model.state_space import Inputs, StateSpaceModel, with_effects
-from nnap_em.numerics.gaussian import Gaussian
-from nnap_em.systems import specs
-from nnap_em.systems.arm import TwoLinkArm
 
 BODY = {
     "m1": 0.52, "m2": 0.63, "l1": 0.2, "l2": 0.3, "lc1": 0.2, "lc2": 0.26, "I1": 0.011, "I2": 0.01, "g": 9.81,

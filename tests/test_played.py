@@ -13,15 +13,15 @@ import numpy as np
 import pytest
 from helpers import file_rig, optimised, rate
 
-from nnap_em.data.dataset import Dataset
-from nnap_em.data.rig import read_rig
-from nnap_em.effects import catalogue
-from nnap_em.effects.function import Axis, UnknownFunction
-from nnap_em.export.c99 import torques, write_c
-from nnap_em.export.mjcf import write_mjcf
-from nnap_em.fit.identify import Identified, begin
+from nnap_em.estimate.identify import Identified, begin
+from nnap_em.logs.dataset import Dataset
+from nnap_em.machines.rig import read_rig
+from nnap_em.machines.systems import specs
+from nnap_em.model.effects import catalogue
+from nnap_em.model.effects.function import Axis, UnknownFunction
 from nnap_em.model.state_space import with_effects
-from nnap_em.systems import specs
+from nnap_em.output.export.c99 import torques, write_c
+from nnap_em.output.export.mjcf import write_mjcf
 
 a, c = jnp.asarray, catalogue
 CART = """<mujoco model="two"><compiler angle="radian"/><worldbody>

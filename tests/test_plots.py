@@ -5,14 +5,14 @@ import numpy as np
 import pytest
 from helpers import right_residual
 
-from nnap_em.data.dataset import Dataset
-from nnap_em.diagnosis.residual import Names, Residual
-from nnap_em.effects.base import Curve
-from nnap_em.fit.identify import FrictionTable
-from nnap_em.fit.predict import Prediction
-from nnap_em.report.fit_plots import effect_figure, error_figure, friction_figure, prediction_figure
-from nnap_em.report.html import picture
-from nnap_em.report.residual_plots import innovation_figure, residual_figure
+from nnap_em.estimate.identify import FrictionTable
+from nnap_em.estimate.predict import Prediction
+from nnap_em.explain.diagnosis.residual import Names, Residual
+from nnap_em.logs.dataset import Dataset
+from nnap_em.model.effects.base import Curve
+from nnap_em.output.report.fit_plots import effect_figure, error_figure, friction_figure, prediction_figure
+from nnap_em.output.report.html import picture
+from nnap_em.output.report.residual_plots import innovation_figure, residual_figure
 
 SEQUENCES, ROWS = 8, 200
 

@@ -8,14 +8,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from nnap_em.data.dataset import Dataset
-from nnap_em.data.rig import Declared, Rig
-from nnap_em.fit.identify import Identified, begin, friction_table, phi_samples
-from nnap_em.fit.predict import Prediction, given_samples, horizon_errors, posterior_of, predict, smooth
+from nnap_em.base.gaussian import Gaussian
+from nnap_em.estimate.identify import Identified, begin, friction_table, phi_samples
+from nnap_em.estimate.predict import Prediction, given_samples, horizon_errors, posterior_of, predict, smooth
+from nnap_em.logs.dataset import Dataset
+from nnap_em.machines.rig import Declared, Rig
+from nnap_em.machines.systems.pendulum import Pendulum
 from nnap_em.model.simulate import simulate
 from nnap_em.model.state_space import Inputs, StateSpaceModel
-from nnap_em.numerics.gaussian import Gaussian
-from nnap_em.systems.pendulum import Pendulum
 
 DT, ROWS, SAMPLES = 0.02, 80, 400
 GIVEN = 0.5

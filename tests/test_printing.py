@@ -5,10 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from nnap_em.data.dataset import Dataset
-from nnap_em.data.rig import Declared, Rig
-from nnap_em.effects import catalogue
-from nnap_em.fit.identify import begin
+from nnap_em.estimate.identify import begin
+from nnap_em.logs.dataset import Dataset
+from nnap_em.machines.rig import Declared, Rig
+from nnap_em.model.effects import catalogue
 from nnap_em.model.state_space import with_effects
 
 RIG = Rig(

@@ -4,8 +4,8 @@ import jax
 import jax.numpy as jnp
 from helpers import compiled
 
-from nnap_em.numerics import programs
-from nnap_em.numerics.parallel import each
+from nnap_em.base import programs
+from nnap_em.base.parallel import each
 
 
 def _scaled(common, one):

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from nnap_em.data.dataset import Dataset
-from nnap_em.data.rig import Declared, Rig
-from nnap_em.fit.check import rates
-from nnap_em.fit.rates import MISREAD, timing
+from nnap_em.explain.check import rates
+from nnap_em.explain.rates import MISREAD, timing
+from nnap_em.logs.dataset import Dataset
+from nnap_em.machines.rig import Declared, Rig
 
 DT, ROWS, COUNT = 0.02, 401, 5
 RIG = Rig("s", "slide", {"m": Declared(1.0, 0.0)}, True, ("u",), (1,), DT, "sequence", ("x", "dx"), {}, {})

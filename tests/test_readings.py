@@ -4,12 +4,12 @@ import jax
 import numpy as np
 import pytest
 
-from nnap_em.data.dataset import pad
-from nnap_em.data.noise import fast_reading_noise, reading_noise, resolution
-from nnap_em.data.rig import Declared, Rig
-from nnap_em.em.build import build
-from nnap_em.em.mstep import RELEASES, RESTING_OFFSET
-from nnap_em.em.readings import RESTS, ROWS_BEFORE, at_rest, onset
+from nnap_em.estimate.em.build import build
+from nnap_em.estimate.em.mstep import RELEASES, RESTING_OFFSET
+from nnap_em.estimate.em.readings import RESTS, ROWS_BEFORE, at_rest, onset
+from nnap_em.logs.dataset import pad
+from nnap_em.logs.noise import fast_reading_noise, reading_noise, resolution
+from nnap_em.machines.rig import Declared, Rig
 
 T = 0.01 * np.arange(600)
 

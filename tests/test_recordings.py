@@ -28,7 +28,7 @@ from rosbags import rosbag1, rosbag2
 from rosbags.typesys import Stores, get_typestore
 
 from nnap_em.errors import DataError
-from nnap_em.import_.files import reader
+from nnap_em.logs.importing.files import reader
 
 T = 0.01 * np.arange(300)
 Q = np.stack([np.sin(T), np.cos(2 * T)], axis=1)

@@ -10,14 +10,14 @@ import pytest
 import scipy.stats
 from helpers import right_residual
 
-from nnap_em.data.dataset import pad
-from nnap_em.data.rig import Declared, Rig
-from nnap_em.data.units import with_names
-from nnap_em.diagnosis.residual import Names, names_of, residual
-from nnap_em.diagnosis.statistics import FAILS, dependence, holm, spread, whiteness
-from nnap_em.diagnosis.statistics import tests as run_tests
-from nnap_em.effects.position import TorsionalSpring
-from nnap_em.fit.identify import begin
+from nnap_em.estimate.identify import begin
+from nnap_em.explain.diagnosis.residual import Names, names_of, residual
+from nnap_em.explain.diagnosis.statistics import FAILS, dependence, holm, spread, whiteness
+from nnap_em.explain.diagnosis.statistics import tests as run_tests
+from nnap_em.logs.dataset import pad
+from nnap_em.machines.rig import Declared, Rig
+from nnap_em.machines.units import with_names
+from nnap_em.model.effects.position import TorsionalSpring
 from nnap_em.model.state_space import with_effects
 
 DT = 0.01

@@ -7,13 +7,13 @@ import tomllib
 
 import pytest
 
-from nnap_em.commands import cli
-from nnap_em.data.limits import Bounds
-from nnap_em.data.rig import Declared, Rig, SystemSpec, read_rig, write_rig
-from nnap_em.data.table import flat
-from nnap_em.data.units import parameter_unit
+from nnap_em.cli import main as cli
 from nnap_em.errors import RigError
-from nnap_em.systems import specs
+from nnap_em.machines.limits import Bounds
+from nnap_em.machines.rig import Declared, Rig, SystemSpec, read_rig, write_rig
+from nnap_em.machines.systems import specs
+from nnap_em.machines.table import flat
+from nnap_em.machines.units import parameter_unit
 
 STATES = ("theta1", "theta2", "dtheta1", "dtheta2")
 REQUIRED = ("m1", "m2", "l1", "l2", "lc1", "lc2", "I1", "I2", "g")

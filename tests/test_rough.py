@@ -9,12 +9,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from nnap_em import read_logs
-from nnap_em.data.formats import write_csv
-from nnap_em.data.logs import Logs
-from nnap_em.data.missing import interpolated
-from nnap_em.data.plausible import Columns
-from nnap_em.data.rough import rough
 from nnap_em.errors import DataError, DataWarning
+from nnap_em.logs.formats import write_csv
+from nnap_em.logs.missing import interpolated
+from nnap_em.logs.plausible import Columns
+from nnap_em.logs.read import Logs
+from nnap_em.logs.rough import rough
 
 DT, ROWS = 0.01, 501
 NOISE = {"theta1": 0.005, "dtheta1": 0.05}

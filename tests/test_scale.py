@@ -8,11 +8,11 @@ import numpy as np
 import plant
 import pytest
 
-from nnap_em.data.dataset import Dataset
-from nnap_em.data.rig import Declared, Rig
-from nnap_em.em.build import build_system, measure_scales
-from nnap_em.fit.check import torques
-from nnap_em.fit.identifiability import holding, not_identifiable
+from nnap_em.estimate.em.build import build_system, measure_scales
+from nnap_em.estimate.identifiability import holding, not_identifiable
+from nnap_em.explain.check import torques
+from nnap_em.logs.dataset import Dataset
+from nnap_em.machines.rig import Declared, Rig
 
 BODY = {"m": Declared(1.3, 0.3), "lc": Declared(0.3, 0.0), "I": Declared(0.02, 0.01), "g": Declared(9.81, 0.0)}
 SWING = Rig("swing", "pendulum", BODY, True, ("u",), (1,), 0.02, "sequence", ("theta1",), {"theta1": 0.002}, {})

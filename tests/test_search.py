@@ -13,28 +13,28 @@ import plant
 import pytest
 from helpers import around, declared_model, slide
 
-from nnap_em.data.dataset import Dataset
-from nnap_em.data.rig import Declared, Rig
-from nnap_em.diagnosis import backward, diagnose, rounds, search, trial
-from nnap_em.diagnosis.context import SearchContext, chosen, lengths_of, likelier
-from nnap_em.diagnosis.hypothesis import Evidence, Hypothesis, covariances
-from nnap_em.diagnosis.keys import completed, key_of, remainder_of, replaced
-from nnap_em.diagnosis.outcome import Diagnosis, Step, Suspect
-from nnap_em.diagnosis.propose import seeded
-from nnap_em.diagnosis.rounds import decided, joined
-from nnap_em.diagnosis.screen import Screened
-from nnap_em.diagnosis.search import Method, Progress, Round
-from nnap_em.diagnosis.trial import Trial, certainty, leader
-from nnap_em.diagnosis.verdict import Share
-from nnap_em.effects import AbstractEffect, Candidate, catalogue, flat
-from nnap_em.effects.function import Axis, InputAxis
-from nnap_em.em.loop import EMState
-from nnap_em.em.recorded import Risen
-from nnap_em.fit.identify import Identified
+from nnap_em.base.deadline import TimeUp, until
+from nnap_em.base.journal import HERE, step
+from nnap_em.estimate.em.loop import EMState
+from nnap_em.estimate.em.recorded import Risen
+from nnap_em.estimate.identify import Identified
+from nnap_em.estimate.smoother.start import StartBank
+from nnap_em.explain.diagnosis import backward, diagnose, rounds, search, trial
+from nnap_em.explain.diagnosis.context import SearchContext, chosen, lengths_of, likelier
+from nnap_em.explain.diagnosis.hypothesis import Evidence, Hypothesis, covariances
+from nnap_em.explain.diagnosis.keys import completed, key_of, remainder_of, replaced
+from nnap_em.explain.diagnosis.outcome import Diagnosis, Step, Suspect
+from nnap_em.explain.diagnosis.propose import seeded
+from nnap_em.explain.diagnosis.rounds import decided, joined
+from nnap_em.explain.diagnosis.screen import Screened
+from nnap_em.explain.diagnosis.search import Method, Progress, Round
+from nnap_em.explain.diagnosis.trial import Trial, certainty, leader
+from nnap_em.explain.diagnosis.verdict import Share
+from nnap_em.logs.dataset import Dataset
+from nnap_em.machines.rig import Declared, Rig
+from nnap_em.model.effects import AbstractEffect, Candidate, catalogue, flat
+from nnap_em.model.effects.function import Axis, InputAxis
 from nnap_em.model.state_space import with_effects
-from nnap_em.smoother.start import StartBank
-from nnap_em.storage.deadline import TimeUp, until
-from nnap_em.storage.journal import HERE, step
 
 GAIN, ZONE, DRAG, HOOKE, FREE = "motor_gain", "dead_zone", "air_drag", "torsional_spring", "unknown_function"
 MODEL, RULE = slide()

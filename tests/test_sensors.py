@@ -14,28 +14,28 @@ import pytest
 from helpers import csv_text, file_rig, written_again
 from machines import arm
 
-from nnap_em.data.dataset import Dataset
-from nnap_em.data.rig import read_rig
-from nnap_em.effects.sensor import SensorBias
-from nnap_em.em.build import build_system
-from nnap_em.em.mstep import _noise_floor
-from nnap_em.em.prior import ParameterPrior
-from nnap_em.em.quadratic import local, quadratic, readings_at
+from nnap_em.base.gaussian import Gaussian
 from nnap_em.errors import RigError
-from nnap_em.export.model import parameters
-from nnap_em.fit.identify import begin
-from nnap_em.fit.store import load, save
-from nnap_em.init.from_machine import draft_machine
+from nnap_em.estimate.em.build import build_system
+from nnap_em.estimate.em.mstep import _noise_floor
+from nnap_em.estimate.em.prior import ParameterPrior
+from nnap_em.estimate.em.quadratic import local, quadratic, readings_at
+from nnap_em.estimate.identify import begin
+from nnap_em.estimate.smoother.gaussian import ExtendedKalmanSmoother
+from nnap_em.estimate.smoother.kalman import Tangent, kalman_filter, linear_reading
+from nnap_em.estimate.smoother.start import StartBank
+from nnap_em.estimate.store import load, save
+from nnap_em.logs.dataset import Dataset
+from nnap_em.logs.draft.from_machine import draft_machine
+from nnap_em.machines.rig import read_rig
+from nnap_em.machines.systems import specs
 from nnap_em.model.base import prepare
+from nnap_em.model.effects.sensor import SensorBias
 from nnap_em.model.friction import FixedFriction, NoFriction
 from nnap_em.model.law import StribeckLaw
 from nnap_em.model.simulate import simulate
 from nnap_em.model.state_space import Inputs, StateSpaceModel
-from nnap_em.numerics.gaussian import Gaussian
-from nnap_em.smoother.gaussian import ExtendedKalmanSmoother
-from nnap_em.smoother.kalman import Tangent, kalman_filter, linear_reading
-from nnap_em.smoother.start import StartBank
-from nnap_em.systems import specs
+from nnap_em.output.export.model import parameters
 
 ROOT = Path(__file__).resolve().parents[1]
 KINDS = ("gyro", "accelerometer", "framepos")

@@ -10,20 +10,20 @@ import numpy as np
 import pytest
 from helpers import PENDULUM, rig_text, servo_model, written_again
 
-from nnap_em.data.dataset import Dataset
-from nnap_em.data.logs import read_logs
-from nnap_em.data.rig import Declared, Rig, read_rig
-from nnap_em.data.servo import KINDS
-from nnap_em.effects.actuator import InputDelay
-from nnap_em.em.build import build, build_system
-from nnap_em.em.servos import build_servos
 from nnap_em.errors import DataError, ExportError, RigError
-from nnap_em.export.model import write_model
-from nnap_em.fit.identifiability import identifiability, sentences
-from nnap_em.fit.identify import begin
-from nnap_em.fit.store import load, save
+from nnap_em.estimate.em.build import build, build_system
+from nnap_em.estimate.em.servos import build_servos
+from nnap_em.estimate.identifiability import identifiability, sentences
+from nnap_em.estimate.identify import begin
+from nnap_em.estimate.store import load, save
+from nnap_em.logs.dataset import Dataset
+from nnap_em.logs.read import read_logs
+from nnap_em.machines.rig import Declared, Rig, read_rig
+from nnap_em.machines.servo import KINDS
+from nnap_em.machines.systems import specs
+from nnap_em.model.effects.actuator import InputDelay
 from nnap_em.model.servo import LAWS
-from nnap_em.systems import specs
+from nnap_em.output.export.model import write_model
 
 BODY = '<inertial pos="0 0 -.2" mass=".5" diaginertia=".002 .002 .002"/>'
 TWO = f"""<mujoco><worldbody><body name="b"><joint name="a" axis="0 1 0"/>{BODY}

@@ -5,12 +5,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from nnap_em.diagnosis.shapes import shape
-from nnap_em.effects import catalogue
-from nnap_em.effects.base import Curve
-from nnap_em.effects.function import Axis, InputAxis
-from nnap_em.systems.pendulum import Pendulum
-from nnap_em.systems.slide import Slide
+from nnap_em.explain.diagnosis.shapes import shape
+from nnap_em.machines.systems.pendulum import Pendulum
+from nnap_em.machines.systems.slide import Slide
+from nnap_em.model.effects import catalogue
+from nnap_em.model.effects.base import Curve
+from nnap_em.model.effects.function import Axis, InputAxis
 
 PENDULUM = Pendulum(**{k: jnp.asarray(v) for k, v in dict(m=0.5, lc=0.3, I=0.02, g=9.81).items()}, joints=(1,))
 SLIDE = Slide(m=jnp.asarray(1.0), joints=(1,))

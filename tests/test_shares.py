@@ -4,11 +4,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from nnap_em.data.dataset import Dataset
-from nnap_em.diagnosis.losses import Linearised
-from nnap_em.diagnosis.screen import Rows, fold_of, motions, project, shares, shifted, times
-from nnap_em.effects import Candidate, catalogue
-from nnap_em.em.multistep import ratio
+from nnap_em.estimate.em.multistep import ratio
+from nnap_em.explain.diagnosis.losses import Linearised
+from nnap_em.explain.diagnosis.screen import Rows, fold_of, motions, project, shares, shifted, times
+from nnap_em.logs.dataset import Dataset
+from nnap_em.model.effects import Candidate, catalogue
 
 GAIN = catalogue["motor_gain"](jnp.zeros(()), joint=1)
 WIDE = catalogue["motor_gain"](jnp.asarray(1e9), joint=1)

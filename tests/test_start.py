@@ -6,9 +6,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from nnap_em.data.dataset import Dataset
-from nnap_em.data.rig import Declared
-from nnap_em.em.build import ALL_STARTS, RATE_STARTS, build
+from nnap_em.estimate.em.build import ALL_STARTS, RATE_STARTS, build
+from nnap_em.logs.dataset import Dataset
+from nnap_em.machines.rig import Declared
 from nnap_em.model.simulate import declared, examples, paper_model
 
 KEY = jax.random.key(0)

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from helpers import slide
 
-from nnap_em.em import stated
-from nnap_em.em.loop import e_step
+from nnap_em.estimate.em import stated
+from nnap_em.estimate.em.loop import e_step
+from nnap_em.estimate.smoother.gaussian import ExtendedKalmanSmoother
+from nnap_em.estimate.smoother.start import StartBank
 from nnap_em.model.simulate import simulate
-from nnap_em.smoother.gaussian import ExtendedKalmanSmoother
-from nnap_em.smoother.start import StartBank
 
 KEY = jax.random.key(3)
 

@@ -10,13 +10,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from nnap_em.data.dataset import Dataset
-from nnap_em.data.rig import Declared, Rig
 from nnap_em.errors import StoreError
-from nnap_em.fit.identify import Identified, begin
-from nnap_em.fit.store import fingerprint, load, read, save
-from nnap_em.smoother.gaussian import CubatureSmoother
-from nnap_em.smoother.particle import ExactBackward, Guided, ParticleSmoother
+from nnap_em.estimate.identify import Identified, begin
+from nnap_em.estimate.smoother.gaussian import CubatureSmoother
+from nnap_em.estimate.smoother.particle import ExactBackward, Guided, ParticleSmoother
+from nnap_em.estimate.store import fingerprint, load, read, save
+from nnap_em.logs.dataset import Dataset
+from nnap_em.machines.rig import Declared, Rig
 
 ARM = {
     name: Declared(value, 0.1 * value)

@@ -5,10 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from nnap_em.base.gaussian import Gaussian
+from nnap_em.machines.systems import specs, systems
+from nnap_em.machines.systems.acrobot import table_i
 from nnap_em.model.state_space import Inputs, StateSpaceModel
-from nnap_em.numerics.gaussian import Gaussian
-from nnap_em.systems import specs, systems
-from nnap_em.systems.acrobot import table_i
 
 PARAMETERS = {
     "acrobot": {**table_i, "Ir": 6e-5, "gr": 6.0, "lc1": 0.12, "I2": 2e-3},  # not the uniform rods: every term counts

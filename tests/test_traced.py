@@ -10,11 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from nnap_em.base import parallel, traced
+from nnap_em.base.gaussian import Gaussian
+from nnap_em.estimate.smoother.kalman import Affine, Cubature, Tangent
 from nnap_em.model.simulate import examples
 from nnap_em.model.state_space import Inputs, StateSpaceModel
-from nnap_em.numerics import parallel, traced
-from nnap_em.numerics.gaussian import Gaussian
-from nnap_em.smoother.kalman import Affine, Cubature, Tangent
 
 
 @pytest.fixture
@@ -84,7 +84,7 @@ def test_a_program_found_again_gives_the_same_to_the_last_bit_and_traces_nothing
 
     whole, mark = path.read_bytes(), tmp_path / "mark"
     form, _, program = whole.partition(b"\n")
-    assert json.loads(form)[0] == "nnap_em.smoother.kalman:Affine"
+    assert json.loads(form)[0] == "nnap_em.estimate.smoother.kalman:Affine"
     path.write_bytes(json.dumps(["os:mkdir", str(mark)]).encode() + b"\n" + program)
     assert traced._read(path) is None and not mark.exists()
     path.write_bytes(whole[: len(whole) // 2])

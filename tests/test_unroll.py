@@ -10,13 +10,13 @@ import plant
 import pytest
 from helpers import around, declared_model
 
-from nnap_em.effects import catalogue
+from nnap_em.base.elementary import cos, sin
 from nnap_em.errors import ExportError
-from nnap_em.export.c99 import WHOLE, Dialect, function
-from nnap_em.export.unroll import unroll
+from nnap_em.model.effects import catalogue
 from nnap_em.model.friction import FrictionNetwork
 from nnap_em.model.state_space import Inputs, with_effects
-from nnap_em.numerics.elementary import cos, sin
+from nnap_em.output.export.c99 import WHOLE, Dialect, function
+from nnap_em.output.export.unroll import unroll
 
 MODEL = declared_model(plant.Case(steps=20, hidden=False))
 CANDIDATES = {name: laws[0].probes[0] for name, kind in catalogue.items() if (laws := kind.candidates(around(MODEL)))}

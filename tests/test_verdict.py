@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from nnap_em.diagnosis import verdict
+from nnap_em.explain.diagnosis import verdict
 
 FALLS = (0.3, 0.3, 0.3, 0.3)
 

@@ -46,7 +46,9 @@ def test_the_wheel_holds_the_package_and_runs_elsewhere(tmp_path):
     site = _run(python, "-c", "import sysconfig; print(sysconfig.get_path('purelib'))", cwd=tmp_path).strip()
     (Path(site) / "packages_of_the_test.pth").write_text(sysconfig.get_path("purelib") + "\n")
     assert _run(python, "-c", "import nnap_em; print(nnap_em.__file__)", cwd=tmp_path).startswith(site)
-    written = _run(python, "-c", "from nnap_em.report.page import page; print(page({'effects': []}))", cwd=tmp_path)
+    written = _run(
+        python, "-c", "from nnap_em.output.report.page import page; print(page({'effects': []}))", cwd=tmp_path
+    )
     assert "No effect of the catalogue" in written
     assert _run(command, "--version", cwd=tmp_path) == f"nnap-em {nnap_em.__version__}\n"
     small = ("--system", "slide", "--sequences", 1, "--test", 1, "--steps", 20)

@@ -16,23 +16,23 @@ from helpers import file_rig
 from machine_files import CASES, DT, FINE, errors, friction, recorded
 
 from nnap_em import identify
-from nnap_em.data.machine import Machine, unpacked
-from nnap_em.data.rig import Declared, Rig, read_rig
-from nnap_em.effects.actuator import ActuatorLag, Saturation
-from nnap_em.effects.body import Payload
-from nnap_em.effects.friction import BackEmf
-from nnap_em.effects.position import Cogging, TorsionalSpring
 from nnap_em.errors import ExportError
-from nnap_em.export.friction import FrictionForm, friction_form
-from nnap_em.export.mjcf import as_it_is, write_mjcf
-from nnap_em.export.model import write_model
-from nnap_em.export.urdf import write_urdf
-from nnap_em.fit.identify import Identified, begin
-from nnap_em.fit.store import load, save
-from nnap_em.machines.mjcf import read_machine
+from nnap_em.estimate.identify import Identified, begin
+from nnap_em.estimate.store import load, save
+from nnap_em.machines.files.mjcf import read_machine
+from nnap_em.machines.machine import Machine, unpacked
+from nnap_em.machines.rig import Declared, Rig, read_rig
+from nnap_em.machines.systems import specs
+from nnap_em.model.effects.actuator import ActuatorLag, Saturation
+from nnap_em.model.effects.body import Payload
+from nnap_em.model.effects.friction import BackEmf
+from nnap_em.model.effects.position import Cogging, TorsionalSpring
 from nnap_em.model.simulate import declared, paper_model
 from nnap_em.model.state_space import Inputs
-from nnap_em.systems import specs
+from nnap_em.output.export.friction import FrictionForm, friction_form
+from nnap_em.output.export.mjcf import as_it_is, write_mjcf
+from nnap_em.output.export.model import write_model
+from nnap_em.output.export.urdf import write_urdf
 
 HELD = Inputs.held(jnp.ones(1))
 MACHINES = Path(machine_files.__file__).parent / "machines"

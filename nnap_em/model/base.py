@@ -7,8 +7,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from ..data.dataset import Dataset, active_steps, fill_missing
-from ..numerics.gaussian import Gaussian
+from ..base.gaussian import Gaussian
+from ..logs.dataset import Dataset, active_steps, fill_missing
 
 
 class AbstractModel(eqx.Module):

@@ -10,7 +10,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from ..numerics.elementary import asinh
+from ..base.elementary import asinh
 
 
 class AbstractJointMap(eqx.Module):

@@ -6,8 +6,8 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..effects.base import AbstractEffect, OperatingPoint, Scalar, Stream
-from ..systems.plant import AbstractPlant
+from ..machines.systems.plant import AbstractPlant
+from .effects.base import AbstractEffect, OperatingPoint, Scalar, Stream
 from .servo import Servo
 
 Effects = Sequence[AbstractEffect]

@@ -8,8 +8,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..effects.actuator import InputDelay
-from ..effects.base import Scalar
+from .effects.actuator import InputDelay
+from .effects.base import Scalar
 
 Values = Mapping[str, Scalar]
 
@@ -31,7 +31,7 @@ LAWS: Mapping[str, Law] = {
     "damper": Law(lambda p, u: p["kv"] * u, lambda p, fed, q, v: -fed * v),
     "affine": Law(lambda p, u: p["gain"] * u, lambda p, fed, q, v: fed - p.get("kp", 0.0) * q - p.get("kd", 0.0) * v),
 }
-"""Coefficients of the kinds of `data/servo.py`; without bias, limit and delay, which all have but the torque itself.
+"""Coefficients of the kinds of `machines/servo.py`, without bias, limit and delay: all but the torque have those.
 
     position   kp (u - q) - kd v            velocity   kv (u - v)
     voltage    k (u - k v) / R              damper     -kv u v
@@ -50,7 +50,7 @@ class Servo(eqx.Module):
     """Name of the command."""
     kind: str = eqx.field(static=True)
     values: dict[str, Float[Array, "..."]]
-    """Numbers by their keys in rig.toml, in the units of `data/servo.py`; what is not there is none."""
+    """Numbers by their keys in rig.toml, in the units of `machines/servo.py`; what is not there is none."""
     scales: tuple[tuple[str, int, float], ...] = eqx.field(static=True, default=())
     """Numbers that are proportional to columns of the logs: key, place of the column behind those of the inputs, and
     the value of that column at which the number is as declared."""

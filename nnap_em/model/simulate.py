@@ -10,14 +10,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from ..data.dataset import Dataset
-from ..data.rig import Declared, Rig
-from ..numerics.gaussian import Gaussian
-from ..systems import specs
-from ..systems.acrobot import Acrobot, drives, table_i
-from ..systems.base import AbstractSystem
-from ..systems.pendulum import Pendulum
-from ..systems.slide import Slide
+from ..base.gaussian import Gaussian
+from ..logs.dataset import Dataset
+from ..machines.rig import Declared, Rig
+from ..machines.systems import specs
+from ..machines.systems.acrobot import Acrobot, drives, table_i
+from ..machines.systems.base import AbstractSystem
+from ..machines.systems.pendulum import Pendulum
+from ..machines.systems.slide import Slide
 from .law import StribeckLaw
 from .state_space import StateSpaceModel
 

@@ -11,12 +11,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from ..data.dataset import Dataset
-from ..effects.base import AbstractEffect, OperatingPoint, Scalar
-from ..numerics.gaussian import Gaussian
-from ..numerics.ode import in_loop, integrate
+from ..base.gaussian import Gaussian
+from ..base.ode import in_loop, integrate
+from ..logs.dataset import Dataset
 from . import hooks
 from .base import AbstractModel
+from .effects.base import AbstractEffect, OperatingPoint, Scalar
 from .servo import Servo
 
 SUBSTEPS, MOST_STEPS = 2, 64

@@ -1,1 +1,0 @@
-"""Fits of a declared machine to its logs: identify, predict, smooth, save and load."""

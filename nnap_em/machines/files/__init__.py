@@ -1,0 +1,1 @@
+"""Machines from MJCF and URDF files."""

@@ -1,1 +1,0 @@
-"""Small dense algebra, one sample interval of an ODE, elementary functions, and work spread over devices."""

@@ -2,12 +2,10 @@
 
     python benchmarks/changed.py planted --out out/changed dfki_c1-spring2-strong dfki_c0-recorded ...
     python benchmarks/changed.py moved --out out/changed slide-coulomb pendulum-none ...
-    python benchmarks/changed.py real --out out/changed dfki_c1-coulomb dfki_c0-viscous cloudpendulum-mass
     python benchmarks/changed.py table out/changed [--out docs/results/changed_planted.csv]
 
 planted: a fit of every second recording of a rig as it is, then the others with the effect of the case (planted.py)
-planted in them; of `RIG-recorded` nothing is planted.  real: the same with a number of joint 2 that moved, its Coulomb
-friction by 20 % of the published, its viscous friction by as much torque at the typical speed, or its mass by 5 %.
+planted in them; of `RIG-recorded` nothing is planted.
 moved: 8 simulated recordings of 3 s, then 8 of the machine with a number that moved; `slide-coulomb-2` is seed 2.
 One JSON file a case; a case that has one is not run again.
 """
@@ -33,8 +31,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from planted import _commit, score
-from planted_cases import REST, case_of
-from planted_make import DATA, ROOT, make, needed, read
+from planted_cases import case_of
+from planted_make import DATA, ROOT, make
 
 from nnap_em.base.files import replace_text
 from nnap_em.cli.common import MISFIT_STATUS
@@ -96,34 +94,6 @@ def planted(name: str, out: Path) -> dict[str, Any]:
         report = json.loads((found / "report.json").read_text()) if status in (0, MISFIT_STATUS) else None
     record = {"case": name, "truth": truth, "seconds": spent, "processor_seconds": spent, "said": said}
     return record | ({"report": report} if report else {"failed": said})
-
-
-def real(name: str, out: Path) -> dict[str, Any]:
-    """The other half, with a number of joint 2 that moved."""
-    rig, kind = name.split("-")
-    _, _, body, logs, *_ = read(rig)
-    speed = float(np.sqrt(np.mean(np.concatenate([log["dtheta2"] for log in logs.values()]) ** 2)))
-    more = {
-        "coulomb": (FACTOR["coulomb"] - 1) * body["friction2"],
-        "viscous": (FACTOR["viscous"] - 1) * body["friction2"] / speed,
-        "mass": (FACTOR["mass"] - 1) * body["m2"],
-    }
-    fit, half, found = fit_of(rig, out), out / "halves" / name, out / "found" / name
-    shutil.rmtree(half, ignore_errors=True)
-    halves(DATA / rig, DATA / rig / "rig.toml", half, True)
-    for path in half.glob("train/*.csv"):
-        log = logs[f"train/{path.name}"]
-        if kind == "mass":
-            torque = needed(log, {**body, "m2": body["m2"] + more[kind]}) - needed(log, body)
-        else:
-            rate = log["dtheta2"]
-            force = more[kind] * (np.tanh(rate / REST) if kind == "coulomb" else rate)
-            torque = np.stack([np.zeros_like(force), force], axis=-1)
-        mean = np.concatenate([0.5 * (torque[:-1] + torque[1:]), torque[-1:]])
-        write_csv(path, log | {f"tau{j}": log[f"tau{j}"] + mean[:, j - 1] for j in (1, 2)})
-    status, spent, said = command("diagnose", half, "--from", fit, "--out", found)
-    report = json.loads((found / "report.json").read_text()) if status in (0, MISFIT_STATUS) else None
-    return {"case": name, "moved": more[kind], "report": report, "seconds": spent, "said": said}
 
 
 def machine(system: str, kind: str):
@@ -197,7 +167,7 @@ def main() -> None:
     """Run some cases, or write the table."""
     arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     commands = arguments.add_subparsers(dest="command", required=True)
-    kinds = {"planted": planted, "real": real, "moved": moved}
+    kinds = {"planted": planted, "moved": moved}
     for kind in kinds:
         one = commands.add_parser(kind)
         one.add_argument("cases", nargs="+")

@@ -69,7 +69,7 @@ def fit(bench) -> Path:
 def test_help_shows_examples_and_loads_no_jax():
     code = """
 import sys
-from nnap_em.cli import cli
+from nnap_em.cli import main as cli
 for command in ("", "simulate", "init", "check", "identify", "diagnose", "compare", "predict", "smooth", "export"):
     try:
         cli.main([command, "--help"] if command else ["--help"])

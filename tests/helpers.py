@@ -65,6 +65,12 @@ def written_again(rig: Rig, folder: Path) -> Rig:
     return read_rig(folder / "again.toml", specs)
 
 
+def rig_of(folder: Path, text: str) -> Rig:
+    """The rig of this text, which is written to rig.toml in the folder."""
+    (folder / "rig.toml").write_text(text)
+    return read_rig(folder / "rig.toml", specs)
+
+
 def data_sets(shared: Path) -> list[Path]:
     """The rig.toml of every shared data set without a fault; one with a fault has an expected.txt."""
     paths = sorted((shared / "data").glob("*/*/rig.toml"))

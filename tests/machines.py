@@ -2,6 +2,9 @@
 
 from pathlib import Path
 
+import mujoco
+import numpy as np
+
 from nnap_em.machines.files.mjcf import read_machine
 from nnap_em.machines.machine import packed, states
 from nnap_em.machines.systems import AbstractSystem, systems
@@ -35,3 +38,14 @@ def tree(path: Path) -> AbstractSystem:
     count = len(machine.joints)
     whole = machine._replace(states=states(machine), gears=(1.0,) * count)
     return systems["mjcf"].declared({}, tuple(range(1, count + 1)), packed(whole))
+
+
+def physics(model: mujoco.MjModel, states) -> tuple[np.ndarray, np.ndarray]:
+    """Mass matrices, and forces without acceleration, of MuJoCo at coordinates and rates, a state a row."""
+    data, mass = mujoco.MjData(model), np.zeros((len(states), model.nv, model.nv))
+    bias = np.zeros((len(states), model.nv))
+    for k, (data.qpos[:], data.qvel[:]) in enumerate(states):
+        mujoco.mj_forward(model, data)
+        mujoco.mj_fullM(model, data, mass[k])
+        bias[k] = data.qfrc_bias - data.qfrc_spring
+    return mass, bias

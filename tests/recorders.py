@@ -8,7 +8,7 @@ from typing import Any
 
 import h5py
 import numpy as np
-from mcap.writer import CompressionType, IndexType, Writer
+from mcap.writer import CompressionType, Writer
 from mcap_ros2._dynamic import serialize_dynamic
 
 from nnap_em.logs.importing.columns import read_plan
@@ -58,7 +58,6 @@ string label
 uint32 size
 uint32 stride
 """
-FLOAT = "float64 data\n"
 
 
 def ns(t) -> np.ndarray:
@@ -116,10 +115,6 @@ def write_mcap(
             writer.add_message(number, t, data, t)
         writer.finish()
     return path
-
-
-NO_INDEX = {"index_types": IndexType.NONE, "repeat_channels": False, "repeat_schemas": False, "use_statistics": False,
-            "use_summary_offsets": False}  # fmt: skip
 
 
 def imported(log: Path, rig_file: Path, shifts: Mapping[str, float] | None = None) -> Resampled:

@@ -3,11 +3,10 @@
 from pathlib import Path
 
 import numpy as np
-from helpers import rig_text
+from helpers import rig_of, rig_text
 
 from nnap_em.logs.dataset import Dataset
-from nnap_em.machines.rig import Rig, read_rig
-from nnap_em.machines.systems import specs
+from nnap_em.machines.rig import Rig
 
 GRAVITY, MASS, LENGTH, INERTIA = 9.81, 1.2, 0.25, 0.01
 """Gravity [m/s^2]; mass of the rod [kg], its centre below the axis [m], its inertia about that centre [kg m^2]."""
@@ -54,5 +53,4 @@ def rig(folder: Path, *, pendulum: bool = False) -> Rig:
         model = f'type = "pendulum"\nm = {MASS}\nlc = {LENGTH}\nI = {INERTIA}\ng = {GRAVITY}'
     text = rig_text(f'{model}\nfriction = "unknown"\n{inputs}', (joint, f"d{joint}"), DT)
     noise = f"[measurement.noise_std]\n{joint} = {NOISE[0]}\nd{joint} = {NOISE[1]}\n"
-    (folder / "rig.toml").write_text(text + noise)
-    return read_rig(folder / "rig.toml", specs)
+    return rig_of(folder, text + noise)

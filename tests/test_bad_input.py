@@ -1,6 +1,5 @@
 """Bad input, from end to end: each ends in one line that names file, row, column and the hint, and writes nothing."""
 
-import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -16,6 +15,7 @@ from nnap_em.errors import FitError
 MODEL = 'type = "pendulum"\nm = 0.5\nlc = 0.4\nI = 0.002\ng = 9.81\nfriction = "unknown"\nactuated_joint = 1\n'
 NOISE = "\n[measurement.noise_std]\ntheta1 = 0.005\ndtheta1 = 0.05\n"
 RIG = rig_text(MODEL, ("theta1", "dtheta1")) + NOISE
+COLUMNS = RIG[RIG.index("columns = ") :]
 
 
 @pytest.fixture(scope="module")
@@ -58,19 +58,8 @@ def _rig(folder: Path, old: str, new: str) -> None:
     (folder / "rig.toml").write_text(RIG.replace(old, new, 1))
 
 
-def _only(name: str) -> Callable[[Path], object]:
-    """One reading alone is declared."""
-    other = {"theta1": "dtheta1", "dtheta1": "theta1"}[name]
-    text = re.sub(rf"(?m)^{other} = .*\n", "", RIG).replace('["theta1", "dtheta1"]', f'["{name}"]')
-    return lambda folder: (folder / "rig.toml").write_text(text)
-
-
 def _both(*changes: Callable[[Path], object]) -> Callable[[Path], object]:
     return lambda folder: [change(folder) for change in changes]
-
-
-def _swap(one: str, two: str) -> Callable[[str], str]:
-    return _columns(lambda log: {one: log[two], two: log[one]})
 
 
 @_with
@@ -87,10 +76,6 @@ def _cut(folder: Path, first: int, last: int) -> None:
     """test/01.csv: some rows of train/01.csv, their clock set back."""
     rows = {name: values[first:last] for name, values in swing().items()}
     (folder / "test/01.csv").write_text(csv_text(rows | {"time": rows["time"] - rows["time"][0]}))
-
-
-def _wrap(theta):
-    return (theta + 1.0) % (2.0 * np.pi)
 
 
 LOGS = {  # name: (the change of train/01.csv, the words of the message: place | finding | hint)
@@ -116,11 +101,12 @@ LOGS = {  # name: (the change of train/01.csv, the words of the message: place |
     "another dt": (_column("time", lambda t: 2 * t), "column 'time' | 0.02 s apart | correct [sampling] dt"),
     "late start": (_column("time", lambda t: t + 5), "line 2, column 'time' | starts at 5 s | clock = \"session\""),
     "never measured": (_column("theta1", lambda x: x * np.nan), "column 'theta1' | no sample | [measurement]"),
-    "wrapped": (_column("theta1", _wrap), "line 125, column 'theta1' | jumps by 6.283, in 2 places | --unwrap theta1"),
+    "wrapped": (_column("theta1", lambda x: (x + 1.0) % (2.0 * np.pi)),
+        "line 125, column 'theta1' | jumps by 6.283, in 2 places | --unwrap theta1"),
     "angle in degrees": (_column("theta1", np.degrees), "column 'theta1' | 57.3 times | write rad"),
     "rate in rpm": (_column("dtheta1", lambda x: x * 30 / np.pi), "column 'dtheta1' | 0.105 times | rpm: write rad/s"),
     "sign": (_column("dtheta1", np.negative), "column 'dtheta1' | minus column 'dtheta1' | turn the sign"),
-    "angle and rate swapped": (_swap("theta1", "dtheta1"),
+    "angle and rate swapped": (_columns(lambda log: {"theta1": log["dtheta1"], "dtheta1": log["theta1"]}),
         "column 'theta1' | is the rate of 'dtheta1'; swap the names 'theta1'"),
 }  # fmt: skip
 FOLDERS = {  # name: (the change of the folder, the words of the message, the file first); more in test_rig.py
@@ -141,15 +127,12 @@ FOLDERS = {  # name: (the change of the folder, the words of the message, the fi
 ERRORS = FOLDERS | {name: (_log_file(change), f"train/01.csv | {words}") for name, (change, words) in LOGS.items()}
 
 
-def _lost(log):
-    return {name: np.delete(x, range(100, 110)) for name, x in log.items()}
-
-
 WARNINGS = {  # what may be meant: name: (the change of the folder, the words of the warning)
     "gap": (_log_file(lambda s: s.replace(s.splitlines()[6] + "\n", "")),
         "line 7, column 'time' | a gap: 0.04 s, then 0.06 s (1 row missing in all) | inputs there are interpolated"),
     "gap in noisy inputs": (
-        _log_file(lambda _: csv_text(_lost(swing()) | {"u": np.random.default_rng(0).normal(0.0, 0.1, 191)})),
+        _log_file(lambda _: csv_text({name: np.delete(x, range(100, 110)) for name, x in swing().items()}
+            | {"u": np.random.default_rng(0).normal(0.0, 0.1, 191)})),
         "line 102, column 'time' | a gap: 0.99 s, then 1.1 s (91 rows after it in all) | cannot be interpolated"),
     "spike": (_log_file(with_field(50, "theta1", "0.5")),
         "line 50, column 'theta1' | reading far from what the readings before and after say (spike) | first at 0.48"),
@@ -157,7 +140,9 @@ WARNINGS = {  # what may be meant: name: (the change of the folder, the words of
         "line 83, column 'theta1' | 39 readings one value over again while the machine moves (stuck)"),
     "constant": (_log_file(_column("theta1", lambda x: 0 * x + 0.25)),
         "train/01.csv | column 'theta1' | constant at 0.25 | is the sensor alive?"),
-    "degrees without a rate": (_both(_only("theta1"), _log_file(_column("theta1", np.degrees))),
+    "degrees without a rate": (_both(
+        _rig(COLUMNS, 'columns = ["theta1"]\n[measurement.noise_std]\ntheta1 = 0.005\n'),
+        _log_file(_column("theta1", np.degrees))),
         "train/01.csv | column 'theta1' | turns at | is it in degrees?"),
     "another motion": (_log_file(_column("dtheta1", lambda x: np.sin(np.arange(x.size) / 11))),
         "train/01.csv | column 'dtheta1' | not the rate of 'theta1' | check units"),

@@ -4,8 +4,6 @@ Runs are independent, so every bound is the distribution that the sum over runs 
 two-sided at 1 in 1000 for all rows of a test together.
 """
 
-import functools
-
 import calibration
 import equinox as eqx
 import jax
@@ -19,7 +17,7 @@ from nnap_em.base.gaussian import Gaussian
 from nnap_em.estimate.smoother.gaussian import GaussianSmoother
 from nnap_em.estimate.smoother.kalman import Cubature, Tangent
 from nnap_em.estimate.smoother.start import StartBank
-from nnap_em.logs.dataset import Dataset, fill_missing
+from nnap_em.logs.dataset import fill_missing
 from nnap_em.model.base import prepare
 from nnap_em.model.simulate import examples, paper_model, simulate
 from nnap_em.model.state_space import StateSpaceModel
@@ -29,12 +27,8 @@ LEVEL = 1e-3
 
 
 def _slide() -> StateSpaceModel:
-    model = eqx.tree_at(lambda m: m.unknown, examples["slide"]().model, _viscous)
+    model = eqx.tree_at(lambda m: m.unknown, examples["slide"]().model, lambda v: -0.8 * v)
     return eqx.tree_at(lambda m: m.log_r, model, jnp.log(jnp.asarray([1e-6])))
-
-
-def _viscous(v):
-    return -0.8 * v
 
 
 def _pendulum() -> StateSpaceModel:
@@ -49,24 +43,9 @@ def _acrobot() -> StateSpaceModel:
     return eqx.tree_at(lambda m: m.start.cov, paper_model(start_std=0.05), cov)
 
 
-MODELS = {"slide": _slide, "pendulum": _pendulum, "acrobot": _acrobot}
 # not the tangent on the acrobot: at the kink of friction it is too sure of itself (docs/trust.md), as is known of it
 slow = pytest.mark.slow  # fast: test_errors_of_filter_and_smoother_are_chi_square
-CASES = ("slide", Tangent()), ("pendulum", Cubature()), pytest.param("acrobot", Cubature(), marks=slow)
-
-
-@functools.cache
-def _logs(name: str) -> tuple[StateSpaceModel, Dataset, np.ndarray]:
-    """RUNS sequences of the model itself, starts from its prior, a fifth of the readings missing."""
-    model = MODELS[name]()
-    key_start, key_run, key_gap = jax.random.split(jax.random.key(3), 3)
-    n = model.log_q.shape[0]
-    x0 = model.start.mean[None] + jax.random.normal(key_start, (RUNS, n)) * jnp.sqrt(jnp.diag(model.start.cov))[None]
-    phase = jnp.linspace(0.0, 6.0, RUNS)[:, None]
-    u = 0.2 * jnp.sin(0.1 * jnp.arange(float(ROWS))[None] + phase)
-    data, x = simulate(model, x0, u[..., None], key=key_run, substeps=model.substeps)
-    gone = jax.random.uniform(key_gap, data.y.shape) < 0.2
-    return model, data._replace(y=jnp.where(gone, jnp.nan, data.y)), np.asarray(x)
+CASES = (_slide, Tangent()), (_pendulum, Cubature()), pytest.param(_acrobot, Cubature(), marks=slow)
 
 
 def _inside(total, freedom) -> None:
@@ -76,20 +55,25 @@ def _inside(total, freedom) -> None:
     assert np.all(np.asarray(total) < scipy.stats.chi2.isf(tail, freedom))
 
 
-def _nees(state: Gaussian, x: np.ndarray) -> np.ndarray:
-    """e' P^-1 e of every row, summed over the runs."""
-    e = x - np.asarray(state.mean)
-    return np.sum(e * np.linalg.solve(np.asarray(state.cov), e[..., None])[..., 0], axis=(0, 2))
-
-
-@pytest.mark.parametrize(("name", "rule"), CASES, ids=["slide", "pendulum", "acrobot"])
-def test_errors_of_filter_and_smoother_are_chi_square(name, rule):
-    """NEES and NIS [Bar-Shalom, Li & Kirubarajan 2001, sec. 5.4]."""
-    model, data, x = _logs(name)
-    smoother = GaussianSmoother(StartBank((1,) * x.shape[-1]), rule, iterations=1)
+@pytest.mark.parametrize(("made", "rule"), CASES, ids=["slide", "pendulum", "acrobot"])
+def test_errors_of_filter_and_smoother_are_chi_square(made, rule):
+    """NEES, e' P^-1 e, and NIS [Bar-Shalom, Li & Kirubarajan 2001, sec. 5.4] of RUNS sequences of the model itself,
+    starts from its prior, a fifth of the readings missing.
+    """
+    model = made()
+    key_start, key_run, key_gap = jax.random.split(jax.random.key(3), 3)
+    n = model.log_q.shape[0]
+    x0 = model.start.mean[None] + jax.random.normal(key_start, (RUNS, n)) * jnp.sqrt(jnp.diag(model.start.cov))[None]
+    phase = jnp.linspace(0.0, 6.0, RUNS)[:, None]
+    u = 0.2 * jnp.sin(0.1 * jnp.arange(float(ROWS))[None] + phase)
+    data, x = simulate(model, x0, u[..., None], key=key_run, substeps=model.substeps)
+    data = data._replace(y=jnp.where(jax.random.uniform(key_gap, data.y.shape) < 0.2, jnp.nan, data.y))
+    smoother = GaussianSmoother(StartBank((1,) * n), rule, iterations=1)
     filtered, smoothed = eqx.filter_jit(jax.vmap(lambda seq: smoother.path(model, prepare(model, seq))))(data)
     for state in (filtered.state, smoothed.state):
-        _inside(_nees(state, x), RUNS * x.shape[-1])
+        e = np.asarray(x - state.mean)
+        nees = e * np.linalg.solve(np.asarray(state.cov), e[..., None])[..., 0]
+        _inside(np.sum(nees, axis=(0, 2)), RUNS * n)
     square, observed = np.asarray(filtered.innovation) ** 2, np.asarray(fill_missing(data.y)[1])
     _inside(square.sum(axis=(0, 2)), observed.sum(axis=(0, 2)))
     _inside(square.sum(), observed.sum())  # innovations are independent of each other: 1 % of the variance shows

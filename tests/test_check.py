@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import file_rig, nnap
+from helpers import file_rig, nnap, rig_of
 from helpers import slide as slide_model
 
 from nnap_em.errors import RigError
@@ -18,8 +18,7 @@ from nnap_em.explain.check import _observability as observability
 from nnap_em.explain.check import _sampling as sampling
 from nnap_em.logs.dataset import Dataset
 from nnap_em.logs.read import REPEAT, Logs, Masked
-from nnap_em.machines.rig import Declared, Rig, read_rig
-from nnap_em.machines.systems import specs
+from nnap_em.machines.rig import Declared, Rig
 from nnap_em.machines.systems.acrobot import table_i
 from nnap_em.model.simulate import examples, sweep_experiment
 
@@ -53,10 +52,6 @@ def _report(logs: Logs, rig: Rig | None = None, test: Logs | None = None) -> dic
     return report
 
 
-def _changed(logs: Logs, **parts) -> Logs:
-    return _logs(logs.data._replace(**{name: change(getattr(logs.data, name)) for name, change in parts.items()}))
-
-
 def test_a_good_data_set_is_all_ok(slide):
     report = _report(slide, test=slide)
     assert {mark for answers in report.values() for mark, _ in answers} == {"ok"}
@@ -86,8 +81,7 @@ of its own between them, 2 kg act 0.4 m off its axis: 7.8 N m."""
 def test_torques_are_held_against_the_loads_along_the_log(tmp_path):
     """In the unit of the file all is well, a thousand times too large is not, and with loads at zero neither was."""
     (tmp_path / "arm.xml").write_text(UPRIGHT)
-    (tmp_path / "rig.toml").write_text(file_rig("arm.xml", ("pan", "shoulder", "twist", "elbow"), dt=0.1))
-    rig = read_rig(tmp_path / "rig.toml", specs)
+    rig = rig_of(tmp_path, file_rig("arm.xml", ("pan", "shoulder", "twist", "elbow"), dt=0.1))
     t = 0.1 * np.arange(ROWS)
     way = np.pi / 4 * (1 - np.cos(0.1 * np.pi * t))  # so slowly that inertia asks for nothing
     y, system = np.stack([0 * t, way, way, way], axis=1), build_system(rig)
@@ -142,14 +136,6 @@ def test_a_place_that_nothing_tells_is_named():
     assert "1 of 2 directions" in finding.text and "not determined: x" in finding.text
 
 
-def test_readings_that_tell_no_velocity_are_bad(slide):
-    report = _report(slide, _rig(noise={"x": 50.0, "dx": 50.0}))
-    assert report["states"][0][0] == "error"
-    assert "0 of 2" in report["states"][0][1]
-    assert report["noise"][0][0] == "error"
-    assert "the motion hardly rises above it" in report["noise"][0][1]
-
-
 ROW = np.arange(ROWS)
 CASES = {  # the words of the check: the change of the readings, of another part of the logs, or of the rig
     "length | error | too few": {"valid": lambda v: v & (ROW < 15)},
@@ -162,14 +148,16 @@ CASES = {  # the words of the check: the change of the readings, of another part
     "motion | warning | it rests most": {"y": lambda y: y * np.where(ROW < 20, 1.0, 1e-3)[None, :, None]},
     "noise | warning | declare more": {"y": lambda y: y + 0.01 * np.random.default_rng(1).normal(size=y.shape)},
     "noise | warning | was filtered": {"rig": _rig(noise={"x": 1e-3, "dx": 0.1})},
+    "noise | error | the motion hardly rises above it": {"rig": _rig(noise={"x": 50.0, "dx": 50.0})},
+    "states | error | 0 of 2": {"rig": _rig(noise={"x": 50.0, "dx": 50.0})},  # which tell no velocity
 }
 
 
 def test_what_is_bad_is_found(slide):
     for words, change in CASES.items():
         subject, mark, text = words.split(" | ")
-        parts = {name: how for name, how in change.items() if name != "rig"}
-        answers = _report(_changed(slide, **parts), change.get("rig"))[subject]
+        parts = {name: how(getattr(slide.data, name)) for name, how in change.items() if name != "rig"}
+        answers = _report(_logs(slide.data._replace(**parts)), change.get("rig"))[subject]
         assert any(actual == mark and text in said for actual, said in answers), answers
     report = _report(_logs(Dataset(*(part[:, :2] for part in slide.data))))
     assert list(report) == ["length", "test", "missing"] and report["length"][0][0] == "error"

@@ -195,23 +195,17 @@ def test_smoothed_states_are_nearer_the_truth_than_the_readings(bench, fit, tmp_
     assert 0.5 < np.sqrt(np.mean(np.concatenate(z) ** 2)) < 2.0
 
 
-def _stop_after(steps: int, monkeypatch):
-    """Ctrl-C right after so many finished steps."""
-    whole = Journal.keep
+def test_a_run_that_was_stopped_goes_on_to_the_same_numbers(bench, fit, tmp_path, monkeypatch, capsys):
+    out = tmp_path / "stopped"
+    argv, whole = ("identify", bench, "--out", out, "--epochs", EPOCHS), Journal.keep
 
     def keep(self, name, outcome):
         whole(self, name, outcome)
-        if len(self.done) == steps:
+        if len(self.done) == 9:  # five of them tell how large the process noise is
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(Journal, "keep", keep)
-
-
-def test_a_run_that_was_stopped_goes_on_to_the_same_numbers(bench, fit, tmp_path, monkeypatch, capsys):
-    out = tmp_path / "stopped"
-    argv = ("identify", bench, "--out", out, "--epochs", EPOCHS)
     with monkeypatch.context() as patch:
-        _stop_after(9, patch)  # five of them tell how large the process noise is
+        patch.setattr(Journal, "keep", keep)
         assert nnap(*argv) == 130
     said = capsys.readouterr().err
     assert said.startswith("nnap-em: compiling for 4 sequences of 151 rows")

@@ -12,11 +12,11 @@ import shutil
 from collections.abc import Iterator
 from types import SimpleNamespace
 
-import h5py
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import begun, nnap
+from recorders import write_hdf5
 from shell import ROOT
 
 from nnap_em import load
@@ -101,9 +101,7 @@ def place(tmp_path_factory):
         (root / "log.csv").write_text((root / "bench/train/000.csv").read_text())
         for i, name in enumerate(("one", "two")):
             table = np.genfromtxt(root / f"bench/train/00{i}.csv", delimiter=",", names=True)
-            with h5py.File(root / f"{name}.h5", "w") as file:
-                for column in table.dtype.names:
-                    file[f"drive/{column}"] = table[column]
+            write_hdf5(root / f"{name}.h5", {"drive": {column: table[column] for column in table.dtype.names}})
         rig = read_rig(root / "bench/rig.toml", specs)
         fitted = begun(rig, read_logs(root / "bench/train", rig).data)
         for name, logs, more in (("fit", "bench", 0.0), ("other", "february", 1.0), ("january", "february", 0.5)):
@@ -132,12 +130,8 @@ def light(place, monkeypatch):
 
     for name in ("identify", "identify_from"):
         bind(identify, name, fitted)
-    for command, writer in (
-        (identify, "write_identification"),
-        (diagnose, "write_diagnosis"),
-        (design, "write_design"),
-    ):
-        bind(command, writer, lambda _: True)
+    for command, report in {identify: "identification", diagnose: "diagnosis", design: "design"}.items():
+        bind(command, f"write_{report}", lambda _: True)
     bind(diagnose, "diagnose", lambda _: Diagnosis(fit, fit, (), ()))
     bind(design, "design", lambda _: None)
     bind(check, "check", lambda _: [])

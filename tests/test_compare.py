@@ -170,11 +170,7 @@ def test_effects_are_compared_and_those_of_one_fit_stand_in_the_table(fits):
 OTHER = (
     ({}, {"system": "sled"}, "the system of a and b differs: slide and sled; compare fits of one machine"),
     ({}, {"parameters": {}}, "the list of parameters of a and b differs"),
-    (
-        {"parameters": {"m": Declared(1.0, 0.0)}},
-        {"parameters": {"m": Declared(1.2, 0.0)}},
-        r"the trusted m of a and b differs: 1 and 1\.2",
-    ),
+    (*({"parameters": {"m": Declared(m, 0.0)}} for m in (1.0, 1.2)), r"the trusted m of a and b differs: 1 and 1\.2"),
 )
 
 

@@ -12,7 +12,6 @@ import pyarrow.parquet as pq
 import pytest
 import scipy.io
 from helpers import csv_text, data_sets, read_table, swing, swing_rig, with_field
-from hypothesis import strategies as st
 
 from nnap_em.errors import DataError
 from nnap_em.logs.dataset import Dataset, fill_missing, horizon, pad
@@ -84,9 +83,6 @@ def test_a_log_is_the_same_in_every_format(tmp_path, suffix, write):
     np.testing.assert_allclose(logs.data.t[0], columns["time"], rtol=1e-11)
     np.testing.assert_allclose(logs.data.u[0, :, 0], columns["u"], rtol=1e-11)
     np.testing.assert_allclose(logs.data.y[0].T, [columns["theta1"], columns["dtheta1"]], rtol=1e-11)
-
-
-_values = st.floats(allow_infinity=False, allow_subnormal=False)
 
 
 MISTAKES = {  # name, which begins with the suffix: (the bytes or the columns, then the words of the message)

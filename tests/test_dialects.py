@@ -203,13 +203,10 @@ MOMENTS = {  # the header, and the texts of a time [s] on 3 November 2026, from 
     "AM and PM": ("Date/Time", lambda day, s: f"{day:%d-%b-%Y %I:%M}:{s:06.3f} {day:%p}"),
     "time of day": ("Time [hh:mm:ss]", lambda day, s: f"{day:%H:%M}:{s:06.3f}"),
 }
+MARKED = [(*moment, *marks) for moment, marks in zip(MOMENTS.values(), itertools.cycle((",.", ";,")), strict=False)]
 
 
-MARKED = zip(MOMENTS.items(), itertools.cycle((",.", ";,")), strict=False)
-MOMENTS = {name: (*moment, *marks) for (name, moment), marks in MARKED}
-
-
-@pytest.mark.parametrize("header, text, separator, decimal", MOMENTS.values(), ids=MOMENTS)
+@pytest.mark.parametrize("header, text, separator, decimal", MARKED, ids=MOMENTS)
 def test_runs_of_one_file_with_times_of_day_are_sequences(tmp_path, header, text, separator, decimal):
     """Three runs of 4 s with silences of 20 s, over midnight."""
     start = datetime(2026, 11, 3, 23, 59, 40, tzinfo=UTC)

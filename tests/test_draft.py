@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers import nnap
 from recorders import Q, robot_log
 
 from nnap_em.cli import main as cli
@@ -15,6 +16,7 @@ from nnap_em.logs.draft.equations import draft_equations
 from nnap_em.logs.draft.from_machine import draft_machine
 from nnap_em.logs.formats import write_csv
 from nnap_em.logs.read import read_logs
+from nnap_em.machines.machine import unpacked
 from nnap_em.machines.rig import read_rig
 from nnap_em.machines.systems import specs
 
@@ -164,7 +166,10 @@ def test_a_robot_of_a_file_is_drafted_and_imported(tmp_path, command, motors, in
     assert rig.input_joints == (1, 2)
     out = tmp_path / "out"
     assert cli.main(["import", str(log), "--rig", str(bench / "rig.toml"), "--out", str(out), "--test", "0"]) == 0
-    q = np.asarray(read_logs(out / "train", read_rig(out / "rig.toml", specs)).data.y)[0, :, :2]
+    again = read_rig(out / "rig.toml", specs)  # which reaches the file where it is
+    one, other = (unpacked(each.machine)._replace(file="") for each in (again, rig))
+    assert one == other and unpacked(again.machine).file.endswith("leg.xml")
+    q = np.asarray(read_logs(out / "train", again).data.y)[0, :, :2]
     np.testing.assert_allclose(q, Q[: len(q)], atol=6e-3)  # the knee is the knee, although it stands first
 
 
@@ -190,15 +195,12 @@ def test_equations_are_drafted_with_names_and_units_of_formulas_and_import_reads
     rows = [f"2026-01-05T23:59:{k // 2:02d}.{k % 2 * 5};{k // 30 * 1.5:g};{comma(y)}" for k, y in enumerate(level)]
     lines = ["Recorder 4", "", "Time;Pump speed;Level", ";[V];[mm]", *(row.replace("1.5;", "1,5;") for row in rows)]
     (tmp_path / "log.csv").write_text("\n".join(lines))
-    text = draft_equations(tmp_path / "log.csv").text
-    assert (
-        'inputs = { "Pump_speed" = "V" }' in text and 'states = { "x1" = "mm" }' in text and "dt = 0.5    # s\n" in text
-    )
+    drafted = draft_equations(tmp_path / "log.csv")
+    text = drafted.text
+    assert drafted.missing == {"model": ["rates"]} and "dt = 0.5    # s\n" in text
+    assert 'inputs = { "Pump_speed" = "V" }' in text and 'states = { "x1" = "mm" }' in text
     (tmp_path / "rig.toml").write_text(text.replace("# rates = ...", 'rates = { x1 = "k*Pump_speed" }\nk = 1.0\n#'))
-    assert (
-        cli.main(["import", *map(str, (tmp_path / "log.csv", "--rig", tmp_path / "rig.toml", "--out", tmp_path / "b"))])
-        == 0
-    )
+    assert nnap("import", tmp_path / "log.csv", "--rig", tmp_path / "rig.toml", "--out", tmp_path / "b") == 0
     data = read_logs(tmp_path / "b" / "train", read_rig(tmp_path / "rig.toml", specs), trust=True).data
     np.testing.assert_allclose(np.asarray(data.y)[0, :, 0], level)
     np.testing.assert_allclose(np.asarray(data.u)[0, :, 0], 1.5 * (np.arange(60) >= 30))

@@ -15,14 +15,11 @@ from nnap_em.explain.diagnosis.keys import replaced
 from nnap_em.explain.diagnosis.propose import seeded
 from nnap_em.logs.dataset import Dataset
 from nnap_em.model.effects import catalogue, fields, flat
+from nnap_em.model.effects.base import a as _a
 from nnap_em.model.effects.function import OVERTONES, PeriodicForce
 from nnap_em.model.state_space import with_effects
 
 STEPS, MOTOR = 60, plant.MOTOR_INERTIA
-
-
-def _a(value):
-    return jnp.asarray(value, float)
 
 
 def _spring(e):
@@ -38,6 +35,10 @@ def _bristle(e):
 
 def _wave(size: float, phase: float) -> tuple[float, float]:
     return size * np.cos(phase), size * np.sin(phase)
+
+
+def _where(e):
+    return {key: e[key] for key in ("joint", "channel") if key in e}
 
 
 def _pulses(e):
@@ -68,12 +69,7 @@ NUMBERS: dict[str, Callable] = {
 """Numbers of the catalogue's effect by those of a simulator's one."""
 
 
-def _of(name: str) -> Callable:
-    where = lambda e: {key: e[key] for key in ("joint", "channel") if key in e}  # noqa: E731
-    return lambda e: catalogue[name](*map(_a, NUMBERS[name](e)), **where(e))
-
-
-MAKE = {name: _of(name) for name in NUMBERS} | {
+MAKE = {name: lambda e, name=name: catalogue[name](*map(_a, NUMBERS[name](e)), **_where(e)) for name in NUMBERS} | {
     "one_sided_loss": lambda e: catalogue["one_sided_loss"](_a(e["loss"]), e["side"], "u", joint=e["joint"]),
     "load_friction": lambda e: catalogue["load_friction"](
         _a(e["mu"]), _a(e["knee"]), names=("u", "dtheta2"), joint=e["joint"]),

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import chain_rig
+from helpers import chain_rig, rig_of
 
 from nnap_em.base.deadline import TimeUp
 from nnap_em.estimate.em.equations import free_term, motion
@@ -22,9 +22,7 @@ from nnap_em.explain.diagnosis.equations import FOLDS, Case, by_simulation, fold
 from nnap_em.explain.diagnosis.hypothesis import Evidence, declared
 from nnap_em.explain.diagnosis.search import Progress, search
 from nnap_em.logs.dataset import pad
-from nnap_em.logs.draft.equations import draft_equations
-from nnap_em.machines.rig import read_rig
-from nnap_em.machines.systems import Equations, specs
+from nnap_em.machines.systems import Equations
 from nnap_em.model.effects import Candidate, OperatingPoint, SensorEffect, catalogue
 from nnap_em.model.effects.equations import UnknownTerm, lean, numbered
 from nnap_em.model.state_space import Inputs
@@ -35,12 +33,12 @@ PLANT = {
     "states": {"a": "m", "b": "m"}, "inputs": {"u": "V"}, "rates": {"a": "u - a", "b": "k*a - b"}, "readings": {},
     "parameters": ["k"], "terms": {}, "enters": {}, "units": {}, "function": "",
 }  # fmt: skip
+SYSTEM = Equations({"k": jnp.ones(())}, json.dumps(PLANT))
 
 
 def _pushes(effect, a=2.0, b=0.5, u=3.0):
-    system = Equations({"k": jnp.ones(())}, json.dumps(PLANT))
     q, inputs, none = jnp.asarray([a, b]), jnp.asarray([u]), jnp.zeros(2)
-    scene = OperatingPoint(system, q, q[:0], none, jnp.zeros(()), none, None, inputs)  # type: ignore[arg-type]
+    scene = OperatingPoint(SYSTEM, q, q[:0], none, jnp.zeros(()), none, None, inputs)  # type: ignore[arg-type]
     return np.asarray(effect.force(scene, jnp.zeros(0)))
 
 
@@ -70,12 +68,11 @@ def test_a_law_pushes_as_its_formula_says():
 
 def test_laws_of_inputs_and_readings_are_the_same_in_the_form_of_all():
     """Gain, bias, dead zone and limit of u beside each other; scale, bias and bend of b; other places stay."""
-    system = Equations({"k": jnp.ones(())}, json.dumps(PLANT))
     laws = [catalogue[name].of(0.4, channel="u") for name in ("motor_gain", "input_bias", "dead_zone", "saturation")]
     laws += [catalogue[name].of(0.4, channel="b") for name in ("sensor_scale", "sensor_bias")]
     laws.append(catalogue["sensor_bend"].of(0.4, 2.0, channel="b", range=4.0))
     for law in laws:
-        form = lean(law, system)
+        form = lean(law, SYSTEM)
         for value in (-1.7, 0.1, 3.0):
             if law.channel == "u":
                 assert form.at_drive({"channel": "u"}, 0).drive(jnp.asarray(value)) == pytest.approx(law.drive(value))
@@ -90,10 +87,10 @@ def test_laws_of_inputs_and_readings_are_the_same_in_the_form_of_all():
 
 def test_laws_of_time_are_the_same_in_the_form_of_all():
     """Delay and lag of u."""
-    system, u = Equations({"k": jnp.ones(())}, json.dumps(PLANT)), jnp.asarray([0.0, 1.0, 3.0, 2.0, 2.0, -1.0])
+    u = jnp.asarray([0.0, 1.0, 3.0, 2.0, 2.0, -1.0])
     for name in ("input_delay", "actuator_lag"):
         law = catalogue[name].of(0.7, channel="u")
-        late = lean(law, system).at_drive({"channel": "u"}, 0).input(u, 0.5)
+        late = lean(law, SYSTEM).at_drive({"channel": "u"}, 0).input(u, 0.5)
         np.testing.assert_allclose(late, law.input(u, 0.5), rtol=1e-12)
 
 
@@ -102,20 +99,17 @@ def test_a_parameter_that_varies_pushes_as_the_equations_with_another_one():
     np.testing.assert_allclose(_pushes(law), [0.0, 0.6 * 2.0], rtol=1e-12)
 
 
-UNITS_OF_A_SLOW_FLOW = {"strength": "1/min", "level": "m", "share": "-", "power": "-"}
-
-
 def test_units_of_a_law_are_those_of_its_port_and_signals():
-    system = Equations({}, json.dumps(PLANT))
     for name, reads, unit in (
         ("linear_flow", ("b",), "1/s"),
         ("product_flow", ("b", "u"), "m/s/(m V)"),
         ("power_flow", ("u",), "m/s/(V)^power"),
     ):
         law = catalogue[name](strength=0.1, channel="a", reads=reads)
-        assert law.units_on(system)["strength"] == unit
+        assert law.units_on(SYSTEM)["strength"] == unit
     slow = Equations({}, json.dumps(PLANT | {"units": {"time": "min"}}))
-    assert catalogue["linear_flow"](strength=0.1, channel="a", reads=("b",)).units_on(slow) == UNITS_OF_A_SLOW_FLOW
+    units = catalogue["linear_flow"](strength=0.1, channel="a", reads=("b",)).units_on(slow)
+    assert units == {"strength": "1/min", "level": "m", "share": "-", "power": "-"}
     assert catalogue["input_delay"].of(0.7, channel="u").units_on(slow) == {"delay": "min"}
 
 
@@ -159,12 +153,11 @@ def test_of_laws_as_likely_that_of_fewer_numbers_is_chosen():
 
 def test_a_strength_that_is_not_determined_is_refused():
     """100 independent errors of size one, three of whose precision and the prior of one determine it to a half."""
-    system = Equations({}, json.dumps(PLANT))
     for strength, determined in ((0.95, False), (1.05, True)):
         law, start = (catalogue["linear_flow"](strength=x, channel="a", reads=("a",)) for x in (strength, 0.0))
         case = _case(1.0, 1, 0.9)
         columns = np.stack([np.full(ERROR.shape, np.sqrt(0.03)), *2 * [np.zeros(ERROR.shape)]], axis=-1)
-        model, prior = SimpleNamespace(effects=(law.lean(system),)), ParameterPrior((), jnp.zeros(3), jnp.ones(3))
+        model, prior = SimpleNamespace(effects=(law.lean(SYSTEM),)), ParameterPrior((), jnp.zeros(3), jnp.ones(3))
         of = case.of._replace(model=model, prior=prior, z=np.zeros(3), columns=columns)
         assert equations._certain(case._replace(of=of, laws=(Candidate(start, (law,), start),))) == determined
 
@@ -193,7 +186,6 @@ def test_laws_that_make_a_reading_worse_at_some_age_are_refused():
 
 def test_each_law_of_a_pair_is_tried_in_the_place_of_the_other():
     """Rivals of a pair have another law in the place of one, and explain nine tenths of what it does."""
-    system = Equations({}, json.dumps(PLANT))
     names, key = ("linear_flow", "square_flow", "cubic_flow"), equations.key_of
     flows = [catalogue[name](strength=0.0, channel="a", reads=("a",)) for name in names]
     laws = [Candidate(law, (), law) for law in (*flows, catalogue["motor_gain"].of(0.0, channel="u"))]
@@ -202,7 +194,7 @@ def test_each_law_of_a_pair_is_tried_in_the_place_of_the_other():
 
     def fitted(*some: Candidate) -> Case:
         left = cost.get(frozenset(key(law.start) for law in some), 90.0)
-        model = SimpleNamespace(effects=tuple(lean(law.start, system) for law in some))
+        model = SimpleNamespace(effects=tuple(lean(law.start, SYSTEM) for law in some))
         return Case(some, _case(1.0, 1, 0.5).of._replace(model=model, z=np.array([left])), left)
 
     cases = [fitted(law) for law in laws[:3]]
@@ -214,7 +206,7 @@ def test_each_law_of_a_pair_is_tried_in_the_place_of_the_other():
 
 def test_laws_that_explain_the_same_are_told_apart_by_what_they_leave_beside_a_second_one():
     """100 independent errors: beside a cubic flow one leaves 40, the other 42 of 100, the same, or 46."""
-    system, key = Equations({}, json.dumps(PLANT)), equations.key_of
+    key = equations.key_of
     names = "linear_flow", "square_flow", "cubic_flow"
     laws = [
         Candidate(law, (law,), law) for law in (catalogue[n](strength=0.0, channel="a", reads=("a",)) for n in names)
@@ -223,7 +215,7 @@ def test_laws_that_explain_the_same_are_told_apart_by_what_they_leave_beside_a_s
         ahead = {frozenset(key(laws[i].start) for i in (k, 2)): left for k, left in ((1, 40.0), (0, other))}
 
         def fitted(*some: Candidate, ahead=ahead) -> Case:
-            model = SimpleNamespace(effects=tuple(lean(law.start, system) for law in some))
+            model = SimpleNamespace(effects=tuple(lean(law.start, SYSTEM) for law in some))
             left = ahead.get(frozenset(key(law.start) for law in some), 90.0)
             return Case(some, _case(1.0, 1, 0.5).of._replace(model=model), left, left=left)
 
@@ -243,18 +235,17 @@ def test_what_is_as_good_in_the_place_of_a_law_is_told():
     key = equations.key_of
     assert equations._in_place_of(key(a), cases[0], cases) == (key(b),)
     assert equations._in_place_of(key(c), cases[0], cases) == (key(b),)
-    system = Equations({}, json.dumps(PLANT | {"readings": {"y": "a", "z": "2*b"}}))
+    readings = Equations({}, json.dumps(PLANT | {"readings": {"y": "a", "z": "2*b"}}))
     bias = of._replace(laws=(Candidate(catalogue["sensor_bias"].of(0.0, channel="y"), (), c),))
-    assert cases[0].places(system) == {"a", "u"} and bias.places(system) == {"y", "a"}
+    assert cases[0].places(readings) == {"a", "u"} and bias.places(readings) == {"y", "a"}
     law = catalogue["varying_parameter"](slope=0.0, middle=1.0, channel="k", reads=("u",))
-    assert of._replace(laws=(Candidate(law, (), law),)).places(system) == {"k", "u", "b", "a"}
+    assert of._replace(laws=(Candidate(law, (), law),)).places(readings) == {"k", "u", "b", "a"}
 
 
 def test_the_common_form_of_a_free_function_is_the_same_function():
-    system = Equations({}, json.dumps(PLANT))
     basis = np.random.default_rng(0).standard_normal((7, 25))
     term = UnknownTerm(jnp.arange(7.0), basis, np.zeros(2), np.full(2, 4.0), channel="b", reads=("b", "u"))
-    form = term.lean(system)
+    form = term.lean(SYSTEM)
     np.testing.assert_allclose(_pushes(form), _pushes(term), rtol=1e-12)
     np.testing.assert_array_equal(numbered(term, form).weights, term.weights)
 
@@ -277,8 +268,7 @@ def test_the_table_of_an_unknown_term_has_its_values_and_their_spread():
 
 
 def _rig(folder: Path, unknown: str = ""):
-    (folder / "rig.toml").write_text(chain_rig('y = "b", z = "a"', unknown))
-    return read_rig(folder / "rig.toml", specs)
+    return rig_of(folder, chain_rig('y = "b", z = "a"', unknown))
 
 
 @pytest.fixture(scope="module")
@@ -380,13 +370,3 @@ def test_of_two_laws_the_share_that_is_lost_without_each_decides(chain):
         hypothesis = hypothesis.plus(effect, law, Evidence(share=0.5, candidate=law))
     square, linear = by_simulation(before, data, lambda text: None).lost(hypothesis)
     assert square > 0.5 and abs(linear) < 0.05
-
-
-def test_a_draft_of_equations_needs_only_the_rates(tmp_path):
-    rows = "\n".join(f"{0.5 * i},{i // 20},{np.sin(i / 9):.6f}" for i in range(200))
-    (tmp_path / "log.csv").write_text(f"time,pump,level\n{rows}\n")
-    draft = draft_equations(tmp_path / "log.csv")
-    assert draft.missing == {"model": ["rates"]}
-    (tmp_path / "rig.toml").write_text(draft.text.replace("# rates = ...", 'rates = { x1 = "0.1*pump - x1" }'))
-    rig = read_rig(tmp_path / "rig.toml", specs)
-    assert (rig.input_columns, rig.measured, rig.dt) == (("pump",), ("level",), 0.5)

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 import scipy.signal
-from helpers import written_again
+from helpers import rig_of, written_again
 
 from nnap_em.errors import FormulaError, RigError
 from nnap_em.estimate import identify as identification
@@ -25,8 +25,7 @@ from nnap_em.estimate.store import load, save
 from nnap_em.explain.check import check
 from nnap_em.logs.dataset import Dataset, pad
 from nnap_em.logs.read import read_logs
-from nnap_em.machines.rig import read_rig
-from nnap_em.machines.systems import register_equations, specs
+from nnap_em.machines.systems import register_equations
 from nnap_em.machines.systems.expression import parse
 from nnap_em.model.effects import catalogue
 from nnap_em.model.hooks import Sampling, late
@@ -47,8 +46,7 @@ columns = { y = "b" }
 
 
 def _rig(folder: Path, model: str = CHAIN, sampling: str = TAIL):
-    (folder / "rig.toml").write_text(HEAD + model + sampling)
-    return read_rig(folder / "rig.toml", specs)
+    return rig_of(folder, HEAD + model + sampling)
 
 
 def _chain(k=1.3, ta=3.0, tb=2.0, rows=240, noise=0.01, seed=0) -> Dataset:
@@ -224,24 +222,19 @@ noise_std = { px = 0.7 }
 """
 
 
-def _swing(starts=(0.7, -0.5), rows=240, length=0.62, damping=0.2) -> tuple[Dataset, np.ndarray]:
-    """Readings of a pendulum without input, by Runge-Kutta steps of scipy; and its angular accelerations."""
-    t, out, fast = 0.03 * np.arange(rows), [], []
-    rate = lambda _, x: [x[1], -9.81 / length * np.sin(x[0]) - damping * x[1]]  # noqa: E731
-    for seed, start in enumerate(starts):
-        x = scipy.integrate.solve_ivp(rate, (0, t[-1]), [start, 0.0], t_eval=t, rtol=1e-9).y
-        noise = 0.7 * np.random.default_rng(seed).standard_normal(rows)
-        out.append((t, np.zeros((rows, 0)), (960 + 640 * length * np.sin(x[0]) + noise)[:, None]))
-        fast.append(rate(0, x)[1])
-    return pad(out), np.array(fast)
-
-
 def test_scales_are_those_of_the_readings_where_the_equations_rest(tmp_path):
     """Without input the declared pendulum hangs still; the size of its motion is that of the readings."""
-    data, fast = _swing()
+    t, out, fast, length = 0.03 * np.arange(240), [], [], 0.62
+    rate = lambda _, x: [x[1], -9.81 / length * np.sin(x[0]) - 0.2 * x[1]]  # noqa: E731
+    for seed, start in enumerate((0.7, -0.5)):  # Runge-Kutta steps of scipy
+        x = scipy.integrate.solve_ivp(rate, (0, t[-1]), [start, 0.0], t_eval=t, rtol=1e-9).y
+        noise = 0.7 * np.random.default_rng(seed).standard_normal(240)
+        out.append((t, np.zeros((240, 0)), (960 + 640 * length * np.sin(x[0]) + noise)[:, None]))
+        fast.append(rate(0, x)[1])
+    data = pad(out)
     model = begin(_rig(tmp_path, SWING, TAIL.replace("0.5", "0.03")), data, key=jax.random.key(0)).model
     size = np.exp(0.5 * np.asarray(model.log_q)) / 0.03
-    assert 0.5 < size[1] / np.sqrt(np.mean(fast**2)) < 2
+    assert 0.5 < size[1] / np.sqrt(np.mean(np.square(fast))) < 2
     np.testing.assert_allclose(np.asarray(model.unknown.scale), size, rtol=1e-9)
     seen = motion(model, data)
     np.testing.assert_allclose([seen.x[:, 0].min(), seen.x[:, 0].max()], [-0.6, 0.9], atol=0.4)  # L is not known

@@ -35,18 +35,13 @@ def _tanks(rows: int = 256):
     return out
 
 
-def _published_tanks(parts, folder):
-    """The file of the benchmark: its sample interval stands in the first row alone, and a comma ends every row."""
-    columns = zip(parts["est"][:, 1], parts["test"][:, 1], parts["est"][:, 2], parts["test"][:, 2], strict=True)
-    rows = [",".join(f"{value:.10g}" for value in row) + (",," if i else ",4,") for i, row in enumerate(columns)]
-    (folder / tanks.PUBLISHED).write_text("\n".join(['"uEst","uVal","yEst","yVal","Ts",', *rows]) + "\n")
-
-
 @pytest.mark.slow  # fast: test_equation_commands.py
 def test_the_tanks_run_from_the_recordings_to_the_figure(tmp_path, monkeypatch, capsys):
     """Nothing is missing in the simulated machine, and its levels are predicted to the noise of the readings."""
-    _published_tanks(_tanks(), tmp_path)
-    out = tmp_path / "out"
+    out, parts = tmp_path / "out", _tanks()  # the sample interval stands in row 1 alone
+    columns = zip(parts["est"][:, 1], parts["test"][:, 1], parts["est"][:, 2], parts["test"][:, 2], strict=True)
+    rows = [",".join(f"{value:.10g}" for value in row) + (",," if i else ",4,") for i, row in enumerate(columns)]
+    (tmp_path / tanks.PUBLISHED).write_text("\n".join(['"uEst","uVal","yEst","yVal","Ts",', *rows]) + "\n")
     monkeypatch.setattr("sys.argv", ["tanks.py", "--from", str(tmp_path), "--out", str(out)])
     with optimised():
         assert tanks.main() == 0

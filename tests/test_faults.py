@@ -5,6 +5,7 @@ process of its own and goes on to its end.
 """
 
 import errno
+import functools
 import json
 import math
 import os
@@ -16,6 +17,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from unittest import mock
 
 import jax
 import jax.numpy as jnp
@@ -76,12 +78,11 @@ def _last_line(said: str) -> str:
     return said.strip().splitlines()[-1]
 
 
+DENIED = PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+
+
 class Killed(BaseException):
     """State of the disk after SIGKILL: no command catches it."""
-
-
-def _denied(*_):
-    raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
 
 
 def _faulty(kind: str, when: int | str):
@@ -103,7 +104,7 @@ def _faulty(kind: str, when: int | str):
                 if kind == "full disk":
                     resource.setrlimit(resource.RLIMIT_FSIZE, (len(content) // 2, limits[1]))
                 else:
-                    patch.setattr(files.os, "replace", _denied)
+                    patch.setattr(files.os, "replace", mock.Mock(side_effect=DENIED))
                 try:
                     whole(path, content)
                 finally:
@@ -130,19 +131,8 @@ def _steps_of_a_toy() -> np.ndarray:
     return x
 
 
-def _toys(patch, rig: Path) -> None:
-    """`identify` of twelve steps of NumPy, whose numbers stand for log-likelihoods."""
-    declared = read_rig(rig / "rig.toml", specs)
-    fitted = begun(declared, read_logs(rig / "train", declared).data)
-
-    def identify(rig, data, *, watch, **_):
-        state = fitted.state._replace(loglik=_steps_of_a_toy())
-        watch(state, data.t.shape[1], np.ones(len(data.t), bool))
-        return fitted._replace(state=state)
-
-    patch.setattr(identify_command, "identify", identify)
-
-
+TOY = functools.reduce(lambda x, i: math.cos(x + i), range(12), 0.0)
+"""The first number of the toy by hand."""
 ERRORS = {"full disk": "File too large", "unwritable": "Permission denied"}
 FAULTS: list[tuple[str, int | str]] = [
     ("in a write", 1),
@@ -163,7 +153,15 @@ FAULTS: list[tuple[str, int | str]] = [
 
 def test_a_chain_of_all_faults_is_survived(rig, tmp_path, monkeypatch, capsys):
     """One run that meets all the faults, one after the other, and then goes on to its end; numbers as of no fault."""
-    _toys(monkeypatch, rig)
+    declared = read_rig(rig / "rig.toml", specs)
+    fitted = begun(declared, read_logs(rig / "train", declared).data)
+
+    def identify(rig, data, *, watch, **_):  # twelve steps of NumPy, whose numbers stand for log-likelihoods
+        state = fitted.state._replace(loglik=_steps_of_a_toy())
+        watch(state, data.t.shape[1], np.ones(len(data.t), bool))
+        return fitted._replace(state=state)
+
+    monkeypatch.setattr(identify_command, "identify", identify)
     assert cli.main(_order("identify", rig, tmp_path / "whole")) == 0
     capsys.readouterr()
     out, kept = tmp_path / "broken", 0
@@ -196,15 +194,7 @@ def test_a_chain_of_all_faults_is_survived(rig, tmp_path, monkeypatch, capsys):
     assert not list(out.rglob(".*.part")) and not (out / "unfinished").exists()
     left = numbers(out)
     assert left == numbers(tmp_path / "whole")
-    assert left["report"]["log_likelihood"][0] == pytest.approx(_toy_after(12))
-
-
-def _toy_after(steps: int) -> float:
-    """The first number of the toy by hand."""
-    x = 0.0
-    for i in range(steps):
-        x = math.cos(x + i)
-    return x
+    assert left["report"]["log_likelihood"][0] == pytest.approx(TOY)
 
 
 def _steps(out: Path) -> list[int]:
@@ -281,7 +271,7 @@ def test_a_step_that_is_damaged_or_of_another_version_is_done_again(tmp_path, mo
     def done() -> int:
         written.clear()
         with keeping(Journal(tmp_path)):
-            assert _steps_of_a_toy()[0] == pytest.approx(_toy_after(12))
+            assert _steps_of_a_toy()[0] == pytest.approx(TOY)
         return len(written)
 
     assert done() == 12

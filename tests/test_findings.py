@@ -24,14 +24,6 @@ ARM = Rig("arm", "acrobot", BODY, True, ("u",), (2,), 0.02, "sequence", ("theta1
 SLIDE = Rig("slide", "slide", {"m": Declared(1.0, 0.0)}, True, ("u",), (1,), 0.02, "sequence", ("x",), {"x": 0.01}, {})
 
 
-def _data(rig: Rig) -> Dataset:
-    """Two sequences of a gentle motion."""
-    t = np.tile(rig.dt * np.arange(ROWS), (2, 1))
-    swing = 0.3 * np.sin(3 * t + np.array([[0.0], [1.0]]))[..., None]
-    u, y = (np.repeat(swing, len(names), axis=2) for names in (rig.input_columns, rig.measured))
-    return Dataset(t, u, y, np.ones(t.shape, bool))
-
-
 def _spring(joint: int) -> AbstractEffect:
     return catalogue["torsional_spring"](*map(jnp.asarray, (20.0, 1.0, 0.0, 0.0)), joint=joint)
 
@@ -43,8 +35,12 @@ def _function(signal: str, joint: int, slope: float) -> AbstractEffect:
 
 @functools.cache
 def _begun(name: str) -> Identified:
+    """A fit to two sequences of a gentle motion, before its first epoch."""
     rig = {"arm": ARM, "slide": SLIDE}[name]
-    return begin(rig, _data(rig), key=jax.random.key(0))
+    t = np.tile(rig.dt * np.arange(ROWS), (2, 1))
+    swing = 0.3 * np.sin(3 * t + np.array([[0.0], [1.0]]))[..., None]
+    u, y = (np.repeat(swing, len(names), axis=2) for names in (rig.input_columns, rig.measured))
+    return begin(rig, Dataset(t, u, y, np.ones(t.shape, bool)), key=jax.random.key(0))
 
 
 def _closed(rig: Rig, *effects: AbstractEffect) -> Diagnosis:

@@ -30,13 +30,8 @@ def test_values_and_derivatives_by_weights_and_velocity():
         slopes = jax.jacfwd(value, argnums=(0, 1))
         return jax.vmap(lambda v: (value(w, v), slopes(w, v), jax.vjp(value, w, v)[1](jnp.ones(2))))(SPEEDS)
 
-    mine, reference = jax.jit(lambda: [all_of(form) for form in (lambda f, v: f(v), _plain)])()
-    for a, b in zip(jax.tree.leaves(mine), jax.tree.leaves(reference), strict=True):
-        np.testing.assert_allclose(a, b, rtol=1e-11, atol=1e-14)
-
-
-def test_in_scalars_it_is_the_same_map():
-    forms = FRICTION.by_entry(), FRICTION
-    both = jax.jit(lambda: [(jax.vmap(f)(SPEEDS), jax.vmap(jax.jacfwd(f))(SPEEDS)) for f in forms])
-    for a, b in zip(*both(), strict=True):
-        np.testing.assert_allclose(a, b, rtol=1e-11, atol=1e-14)
+    forms = (lambda f, v: f(v)), (lambda f, v: f.by_entry()(v)), _plain
+    *both, reference = jax.jit(lambda: [all_of(form) for form in forms])()
+    for mine in both:
+        for a, b in zip(jax.tree.leaves(mine), jax.tree.leaves(reference), strict=True):
+            np.testing.assert_allclose(a, b, rtol=1e-11, atol=1e-14)

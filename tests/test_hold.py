@@ -7,15 +7,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import rig_text, slide
+from helpers import rig_of, rig_text, slide
 from scipy.signal import lsim
 
 from nnap_em.estimate.em.build import build_system
 from nnap_em.explain.check import late
 from nnap_em.explain.inverse_dynamics import lag, regression
 from nnap_em.logs.dataset import Dataset, pad
-from nnap_em.machines.rig import HOLD, SMOOTH, read_rig
-from nnap_em.machines.systems import specs
+from nnap_em.machines.rig import HOLD, SMOOTH
 from nnap_em.model import hooks
 from nnap_em.model.effects import catalogue
 from nnap_em.model.state_space import with_effects
@@ -118,14 +117,6 @@ def test_a_late_sensor_reads_the_line_before_its_row():
     np.testing.assert_allclose(read, past, atol=1e-12)
 
 
-def _rig(tmp_path, hold):
-    slide = (
-        'type = "slide"\nm = { mean = 2.0, std = 0.2 }\nfriction = "unknown"\n[input]\ncolumns = ["u"]\njoints = [1]'
-    )
-    (tmp_path / "rig.toml").write_text(rig_text(slide, ["x"], 0.04).replace(HOLD, hold))
-    return read_rig(tmp_path / "rig.toml", specs)
-
-
 @functools.cache
 def _recordings(hold: str, delay: float = 0.0) -> Dataset:
     """Slides of 2.1 kg with dry and viscous friction under a force in time, every 40 ms, by Runge-Kutta steps."""
@@ -158,7 +149,8 @@ FORCES = {HOLD: lambda smooth, t: smooth(0.04 * np.floor(t / 0.04 + 1e-9)), SMOO
 @pytest.mark.parametrize("declared", FORCES)
 def test_torque_and_motion_show_the_hold(true, declared, tmp_path):
     """They differ by half a row; the line to write is the hold of the truth, and nothing where it is declared."""
-    rig = _rig(tmp_path, declared)
+    model = 'type = "slide"\nm = { mean = 2.0, std = 0.2 }\nfriction = "unknown"\nactuated_joint = 1\n'
+    rig = rig_of(tmp_path, rig_text(model, ["x"], 0.04).replace(HOLD, declared))
     found = lag(regression(rig, build_system(rig), _recordings(true)), 0)
     expected = {(HOLD, SMOOTH): -0.5, (SMOOTH, HOLD): 0.5}.get((declared, true), 0.0)
     assert abs(found.rows - expected) < 0.05 and found.std < 0.03

@@ -3,7 +3,6 @@
 import functools
 import json
 import re
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,7 +11,6 @@ from recorders import JOINTS, MULTI, TOPICS, arrays, joint_states, ns, plain_jso
 
 from nnap_em.logs.importing.signals import Signal, averaged, held, interpolated
 from nnap_em.logs.read import read_logs
-from nnap_em.machines.machine import unpacked
 from nnap_em.machines.rig import read_rig
 from nnap_em.machines.systems import specs
 
@@ -32,15 +30,15 @@ def _theta(t):
     return np.sin(3 * t)
 
 
-def _write(path, t, command_t, command, theta=_theta, joint: str = "joint", **options):
+def _write(path, t, command_t, command, theta=_theta):
     """A JointState topic and a command topic."""
     rate = 3 * np.cos(3 * t) if theta is _theta else 0 * t
-    states = joint_states((joint,), theta(t)[:, None], rate[:, None], stamps=ns(t))
+    states = joint_states(("joint",), theta(t)[:, None], rate[:, None], stamps=ns(t))
     topics = {
         "/js": (ros2(*JOINTS), ns(t + 0.002), states),
         "/cmd": (ros2(*MULTI), ns(command_t), arrays(command)),
     }
-    return write_mcap(path, topics, **options)
+    return write_mcap(path, topics)
 
 
 _import = functools.partial(nnap, "import")
@@ -224,25 +222,6 @@ def test_a_name_that_stands_twice_and_a_folder_that_is_not_empty_are_refused(tmp
         assert _import(path, "--rig", _rig(tmp_path, columns=columns), "--out", tmp_path / to, "--test", 1) == 2
         assert said in capsys.readouterr().err
     assert [p.name for p in out.iterdir()] == ["mine.txt"] and not (tmp_path / "new").exists()
-
-
-def test_a_machine_from_a_file_is_imported_and_found_from_the_new_folder(tmp_path):
-    """Its states are those of the file, which the new rig.toml reaches where it is."""
-    examples = Path(__file__).resolve().parents[1] / "examples" / "machines"
-    for name in ("cartpole.toml", "cartpole.xml"):
-        (tmp_path / name).write_text((examples / name).read_text())
-    rig = read_rig(tmp_path / "cartpole.toml", specs)
-    t = rig.dt * np.arange(200)
-    names = (*rig.input_columns, *rig.measured)
-    rows = np.column_stack([t, *(np.sin((i + 1) * t) for i in range(len(names)))])
-    header = ",".join(("time", *names))
-    np.savetxt(tmp_path / "log.csv", rows, fmt="%.9g", delimiter=",", header=header, comments="")
-    out = tmp_path / "deep" / "bench"
-    assert _import(tmp_path / "log.csv", "--rig", tmp_path / "cartpole.toml", "--out", out, "--test", 0) == 0
-    again = read_rig(out / "rig.toml", specs)
-    one, other = unpacked(again.machine), unpacked(rig.machine)
-    assert (Path(one.file).name, one._replace(file="")) == (other.file, other._replace(file=""))
-    assert read_logs(out / "train", again).data.y.shape[-1] == len(rig.measured)
 
 
 EQUATIONS = """format = 1

@@ -73,12 +73,10 @@ def _gain(factor: float) -> Callable[[Log, int], Dataset]:
     return lambda log, j: log[1]._replace(u=log[1].u * np.where(np.arange(log[1].u.shape[-1]) == j, factor, 1.0))
 
 
-def _shift(degrees: float) -> Callable[[Log, int], Dataset]:
-    return lambda log, j: log[1]._replace(y=log[1].y + np.eye(log[1].y.shape[-1])[j] * math.radians(degrees))
-
-
-def _mirrored(log: Log, j: int) -> Dataset:
-    return log[1]._replace(y=log[1].y * (1 - 2 * np.eye(log[1].y.shape[-1])[j]))
+def _off(log: Log, j: int, gain: float, zero: float) -> Dataset:
+    """Readings of a joint with another gain and zero [rad]."""
+    own = np.eye(log[1].y.shape[-1])[j]
+    return log[1]._replace(y=log[1].y * (1 + (gain - 1) * own) + zero * own)
 
 
 def _weightless(log: Log, j: int) -> Dataset:
@@ -96,7 +94,7 @@ CASES = {
     "current": (_gain(1 / 0.12), "{u} is in another unit: multiply it by 0.12"),
     "per_mille": (_gain(1000 / 1.5), "{u} is in another unit: multiply it by 0.0015"),
     "gravity": (_weightless, "{u}: the gravity of the declared bodies is not in it"),
-    "mirrored": (_mirrored, "{q} counts in the other direction"),
+    "mirrored": (lambda log, j: _off(log, j, -1.0, 0.0), "{q} counts in the other direction"),
 }
 
 
@@ -118,7 +116,7 @@ def test_a_mistake_is_named_with_its_hint(log, case):
 @pytest.mark.parametrize("degrees", [2.0, -170.0])
 def test_a_zero_that_is_off_is_named_with_its_angle(log, degrees):
     for j in range(log[1].y.shape[-1]):
-        (text,) = _warnings(log[0], _shift(degrees)(log, j))
+        (text,) = _warnings(log[0], _off(log, j, 1.0, math.radians(degrees)))
         named = re.match(rf"theta{j + 1} reads (\S+) rad \((\S+) degrees\) more", text)
         assert named and float(named[2]) == pytest.approx(degrees, abs=0.2)
         assert float(named[1]) == pytest.approx(math.radians(degrees), abs=4e-3)

@@ -104,15 +104,11 @@ def _active(time: int) -> np.ndarray:
     return np.arange(time) < time - 1
 
 
-def _reading(p: _Problem) -> Reading:
-    rows = jnp.broadcast_to(p.model.c, (p.y.shape[0], *p.model.c.shape))
-    return Reading(rows, jnp.zeros_like(p.y))
-
-
 @jax.jit
 def _run(p: _Problem, observed, active):
     seq = Prepared(p.u, p.y, observed, active)
-    filtered = kalman_filter(p.model.log_q, p.model.log_r, p.start, p.affine, _reading(p), seq)
+    reading = Reading(jnp.broadcast_to(p.model.c, (p.y.shape[0], *p.model.c.shape)), jnp.zeros_like(p.y))
+    filtered = kalman_filter(p.model.log_q, p.model.log_r, p.start, p.affine, reading, seq)
     return filtered, rts(filtered)
 
 

@@ -54,17 +54,14 @@ def model(tmp_path_factory) -> StateSpaceModel:
 
 
 @eqx.filter_jit
-def _along(law: LoadFriction, model: StateSpaceModel, states):
+def _forces(law: LoadFriction, model: StateSpaceModel, states):
+    """Forces of a law [N m] at angles, rates and torques; one program for all laws of the same numbers."""
+
     def force(q, v, u):
         scene = model.scene(jnp.stack([q, v]), Inputs(u[None], u[None], a(0.0), a(0.0)))
         return law.force(scene, jnp.zeros(0))[0]
 
     return jax.vmap(force)(*states.T)
-
-
-def _forces(law: LoadFriction, model: StateSpaceModel, states: np.ndarray) -> np.ndarray:
-    """Forces of a law [N m] at angles, rates and torques; one program for all laws of the same numbers."""
-    return np.asarray(_along(law, model, jnp.asarray(states)))
 
 
 def _states(count: int = 100) -> np.ndarray:
@@ -80,13 +77,18 @@ def test_a_form_is_that_of_the_paper(law, level, model):
     assert law.is_physical() and set(law.values()) <= set(law.units)
 
 
-def test_forms_are_tried_in_one_order_from_plain_to_rich(around_rod, model):
+def test_forms_are_tried_in_one_order_from_from_plain_to_rich(model):
     """Every richer form begins as the one before it, has a number more, and the last has none behind it."""
-    states, seen, ahead = _states(), [], [c.start for c in LoadFriction.candidates(around_rod)]
+    one = np.ones(1)
+    around = SearchScales(
+        model.system, one, 10 * one, 0 * one, -3 * one, 3 * one, one, ("hinge", "dhinge"), np.ones(2), rod.DT,
+        (0.0, 3.0), 3.0, False, True, ("u",),
+    )  # fmt: skip
+    states, seen, ahead = _states(), [], [c.start for c in LoadFriction.candidates(around)]
     while ahead:
         law = ahead.pop()
         seen.append(law)
-        for candidate in law.richer(around_rod):
+        for candidate in law.richer(around):
             assert len(fields(candidate.start)) > len(fields(law))
             assert jax.tree.structure(candidate.prior_std) == jax.tree.structure(candidate.start)
             np.testing.assert_allclose(_forces(candidate.start, model, states), _forces(law, model, states), atol=1e-14)
@@ -94,13 +96,3 @@ def test_forms_are_tried_in_one_order_from_plain_to_rich(around_rod, model):
                 assert np.abs(_forces(probe, model, states) - _forces(law, model, states)).max() > 1e-4
             ahead.append(candidate.start)
     assert max(len(fields(law)) for law in seen) == len(fields(M6))
-
-
-@pytest.fixture
-def around_rod(model):
-    """Candidates' surroundings of the rod."""
-    one = np.ones(1)
-    return SearchScales(
-        model.system, one, 10 * one, 0 * one, -3 * one, 3 * one, one, ("hinge", "dhinge"), np.ones(2), rod.DT,
-        (0.0, 3.0), 3.0, False, True, ("u",),
-    )  # fmt: skip

@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 import pytest
 from helpers import file_rig, written_again
-from machines import arm, tree
+from machines import arm, physics, tree
 
 from nnap_em.base.gaussian import spd_solve
 from nnap_em.errors import RigError, RigWarning
@@ -45,17 +45,6 @@ def _states(model: mujoco.MjModel, count: int = 6) -> np.ndarray:
     return np.random.default_rng(0).uniform(-3.0, 3.0, (count, 2, model.nv))
 
 
-def _physics(model: mujoco.MjModel, states: np.ndarray):
-    """Mass matrices, and forces without acceleration, of MuJoCo."""
-    data, mass = mujoco.MjData(model), np.zeros((len(states), model.nv, model.nv))
-    bias = np.zeros((len(states), model.nv))
-    for k, (data.qpos[:], data.qvel[:]) in enumerate(states):
-        mujoco.mj_forward(model, data)
-        mujoco.mj_fullM(model, data, mass[k])
-        bias[k] = data.qfrc_bias - data.qfrc_spring
-    return mass, bias
-
-
 def _each(function, *rows):
     """A function of each row, in one small program: a loop is compiled sooner than what `vmap` makes of scalars."""
     return jax.jit(lambda rows: jax.lax.map(lambda row: function(*row), rows))(jax.tree.map(jnp.asarray, rows))
@@ -67,10 +56,6 @@ def _mass_and_bias(system):
 
 def _acceleration(system, x, force):
     return jnp.stack(system.acceleration(*x, force))
-
-
-def _by_mass_matrix(system, x, force):
-    return spd_solve(system.mass(x[0]), force - system.bias(*x))
 
 
 @pytest.mark.parametrize("machine", ["branch.xml", "arm.urdf", "cartpole.xml", 5])
@@ -86,7 +71,7 @@ def test_mass_bias_and_acceleration_are_those_of_mujoco(machine, tmp_path):
         return *_mass_and_bias(system)(x), _acceleration(system, x, force)
 
     ours, bias, rate = _each(own, states, forces)
-    mass, truth = _physics(model, states)
+    mass, truth = physics(model, states)
     np.testing.assert_allclose(ours, mass, atol=1e-12, rtol=1e-12)
     np.testing.assert_allclose(bias, truth, atol=1e-11, rtol=1e-12)
     other = np.linalg.solve(mass, (forces - truth)[..., None])[..., 0]
@@ -103,7 +88,8 @@ def test_derivatives_of_the_acceleration_are_those_of_the_mass_matrix(tmp_path):
 
     def both(at, way):
         of = lambda rule: lambda values, *rest: rule(system.with_parameters(values), *rest)  # noqa: E731
-        own, truth = (jax.jvp(of(rule), at, way)[1] for rule in (_acceleration, _by_mass_matrix))
+        by_mass_matrix = lambda system, x, force: spd_solve(system.mass(x[0]), force - system.bias(*x))  # noqa: E731
+        own, truth = (jax.jvp(of(rule), at, way)[1] for rule in (_acceleration, by_mass_matrix))
         pulled = jax.vjp(of(_acceleration), *at)[1](jnp.arange(1.0, 4.0))
         return own, truth, sum(jnp.sum(a * b) for a, b in zip(*map(jax.tree.leaves, (pulled, way)), strict=True))
 
@@ -166,7 +152,7 @@ def test_changed_numbers_move_the_physics_as_in_mujoco(tmp_path):
     model.body_mass[2] = 2.0
     model.body_ipos[2][0], model.dof_armature[2] = 0.012, 0.02
     states = _states(model)
-    np.testing.assert_allclose(_each(lambda x: system.mass(x[0]), states), _physics(model, states)[0], atol=1e-12)
+    np.testing.assert_allclose(_each(lambda x: system.mass(x[0]), states), physics(model, states)[0], atol=1e-12)
 
 
 def test_friction_of_the_file_acts_where_none_is_learned_and_is_left_out_where_it_is(tmp_path):
@@ -193,7 +179,7 @@ def test_a_payload_of_any_mass_and_centre_moves_the_machine_as_in_mujoco(tmp_pat
         centre = np.add(spot.point, away)
         np.testing.assert_allclose([effect.values()[f"centre_{axis}"] for axis in "xyz"], centre, rtol=1e-12)
         loaded.append(effect.physics(system, jnp.zeros(())) if any(away) else system.vary(*last, mass))
-        truth.append(_physics(_hung(path, system.machine.bodies[spot.body].name, 0.7, centre), states))
+        truth.append(physics(_hung(path, system.machine.bodies[spot.body].name, 0.7, centre), states))
     for ours, theirs in zip(_each(lambda x: [_mass_and_bias(one)(x) for one in loaded], states), truth, strict=True):
         for part, other in zip(ours, theirs, strict=True):
             np.testing.assert_allclose(part, other, atol=1e-10, rtol=1e-12)

@@ -145,13 +145,8 @@ def test_a_branch_goes_back_from_place_to_place():
         expected.append((at[k, place], at[k, source[k, place]]))
         place = source[k, place]
     after, before = np.transpose(expected[::-1])
-    for part, value in (
-        (chain.state, after),
-        (chain.affine, after),
-        (chain.predicted, before),
-        (chain.reading, before),
-    ):
-        for leaf in jax.tree.leaves(part):
+    for parts, value in (((chain.state, chain.affine), after), ((chain.predicted, chain.reading), before)):
+        for leaf in jax.tree.leaves(parts):
             np.testing.assert_array_equal(np.ravel(leaf), value)
     np.testing.assert_array_equal(chain.gain.ravel(), before)
     assert float(chain.loglik) == at[-1, last]

@@ -43,18 +43,6 @@ def _rule(model, centre=None) -> ScoringMStep:
     return ScoringMStep(MASS, centre, (True, True), (True, True), log_q_prior=model.log_q, linearise=Tangent())
 
 
-def _logs(model, sequences: int, time: int = 40) -> Dataset:
-    """Readings of `model`, a fifth missing (the same rows in all), the last five rows padding."""
-    key_run, key_gap, key_start = jax.random.split(jax.random.key(0), 3)
-    unit = jax.random.normal(key_start, (sequences, 2))
-    x0 = model.start.mean[None] + unit * jnp.sqrt(jnp.diag(model.start.cov))[None]
-    u = jnp.broadcast_to(jnp.sin(jnp.arange(float(time)) * DT * 5)[None, :, None], (sequences, time, 1))
-    data = simulate(model, x0, u, key=key_run).data
-    gone = (jax.random.uniform(key_gap, data.y.shape[1:]) < 0.2)[None]
-    valid = jnp.broadcast_to(jnp.arange(time)[None] < time - 5, (sequences, time))
-    return data._replace(y=jnp.where(gone | ~valid[..., None], jnp.nan, data.y), valid=valid)
-
-
 class _Case(NamedTuple):
     """One sequence with its posterior, its expansion, and the likelihood that both belong to."""
 
@@ -124,9 +112,16 @@ def _gradient(case: _Case) -> _Knobs:
 
 @pytest.fixture(scope="module")
 def slides():
-    """200 sequences of the slide."""
-    model = _slide()
-    data = _logs(model, 200)
+    """200 sequences of the slide, a fifth of the readings missing (the same in all), the last five rows padding."""
+    model, time = _slide(), 40
+    key_run, key_gap, key_start = jax.random.split(jax.random.key(0), 3)
+    unit = jax.random.normal(key_start, (200, 2))
+    x0 = model.start.mean[None] + unit * jnp.sqrt(jnp.diag(model.start.cov))[None]
+    u = jnp.broadcast_to(jnp.sin(jnp.arange(float(time)) * DT * 5)[None, :, None], (200, time, 1))
+    data = simulate(model, x0, u, key=key_run).data
+    gone = (jax.random.uniform(key_gap, data.y.shape[1:]) < 0.2)[None]
+    valid = jnp.broadcast_to(jnp.arange(time)[None] < time - 5, (200, time))
+    data = data._replace(y=jnp.where(gone | ~valid[..., None], jnp.nan, data.y), valid=valid)
     return model, data, *_expand(model, data)
 
 

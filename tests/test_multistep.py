@@ -11,18 +11,7 @@ import pytest
 from nnap_em.base.gaussian import Gaussian
 from nnap_em.estimate.em import multistep
 from nnap_em.estimate.em.build import build
-from nnap_em.estimate.em.multistep import (
-    OpenLoop,
-    errors,
-    finish,
-    followed,
-    grid_along,
-    huber,
-    open_loop,
-    ratio,
-    robust_scale,
-    weighed,
-)
+from nnap_em.estimate.em.multistep import OpenLoop, errors, finish, followed, open_loop, ratio, weighed
 from nnap_em.estimate.em.prior import ParameterPrior
 from nnap_em.estimate.em.quadratic import local
 from nnap_em.estimate.em.readings import third_differences, white_readings
@@ -77,7 +66,7 @@ def _followed(known, model=None):
 
 def test_errors_are_those_of_the_model_run_alone(known):
     """None on its own motion; on that of a heavier machine, the difference of the two from the same starts."""
-    grid = grid_along(known.model, known.data)
+    grid = multistep.grid_along(known.model, known.data)
     starts, ages = grid.starts(ROWS), list(grid.ages)
     along = _followed(known)
     error = errors(along)
@@ -183,7 +172,7 @@ def test_a_loud_recording_counts_by_the_root_of_its_loudness():
     """Errors of constant size 1, 1, 1, 4 and one recording without any: scales by hand."""
     size = np.array([1.0, 1.0, 1.0, 4.0, np.nan])
     error = size[:, None, None, None] * np.sign(np.random.default_rng(0).normal(size=(5, 30, 2, 1)))
-    assert robust_scale(error)[:, 0, 0, 0] == pytest.approx(1.4826 * np.array([1.0, 1.0, 1.0, 2.0, 1.0]))
+    assert multistep.robust_scale(error)[:, 0, 0, 0] == pytest.approx(1.4826 * np.array([1.0, 1.0, 1.0, 2.0, 1.0]))
     after = error.copy()
     after[:3] *= 0.5  # three of four recordings are predicted twice as well
     inside = np.array([1.0, 1.0, 1.0, 4.0]) / 1.4826**2  # squared errors in scales: none is an outlier
@@ -192,9 +181,9 @@ def test_a_loud_recording_counts_by_the_root_of_its_loudness():
 
 
 def test_an_outlier_counts_as_a_line():
-    assert huber(np.array(1.0), 1.0) == 1.0
-    assert huber(np.array(10.0), 1.0) == pytest.approx(2 * (2 * 10.0 - 2))
-    assert np.isfinite(huber(np.array(np.inf), 1.0))
+    assert multistep.huber(np.array(1.0), 1.0) == 1.0
+    assert multistep.huber(np.array(10.0), 1.0) == pytest.approx(2 * (2 * 10.0 - 2))
+    assert np.isfinite(multistep.huber(np.array(np.inf), 1.0))
 
 
 def test_weights_are_one_over_the_variance_and_less_for_outliers():

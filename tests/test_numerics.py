@@ -72,16 +72,13 @@ def _one(state, scale):
     return {"wave": jnp.sin(scale * state.mean), "sum": jnp.sum(state.cov @ state.mean * scale)}
 
 
-def _all(function, *trees):
-    return jax.vmap(function)(*trees)
-
-
 @pytest.mark.parametrize("length, states", [(1, 3), (ROWS_AT_ONCE, 3), (ROWS_AT_ONCE + 1, 3), (70, MOST_UNROLLED + 1)])
 def test_rows_in_blocks_are_the_rows_all_at_once(length, states):
     rng = np.random.default_rng(length)
     x, scale = jnp.asarray(rng.normal(size=(length, states))), jnp.asarray(rng.normal(size=length))
     same = lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-13, atol=1e-13)  # noqa: E731
-    jax.tree.map(same, *jax.jit(lambda x, s: [over(_one, _path(x), s) for over in (rows, _all)])(x, scale))
+    every = lambda function, *trees: jax.vmap(function)(*trees)  # noqa: E731
+    jax.tree.map(same, *jax.jit(lambda x, s: [over(_one, _path(x), s) for over in (rows, every)])(x, scale))
 
 
 def test_only_few_states_are_cut_in_blocks():

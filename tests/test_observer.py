@@ -1,4 +1,4 @@
-"""The observer: the library's filter row by row, a closed form, and what an online estimate meets beside."""
+"""The observer: the library's filter row by row, and what an online estimate meets beside."""
 
 import dataclasses
 
@@ -6,25 +6,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import file_rig, slide
+from helpers import file_rig, rig_of, slide
 
 from nnap_em.estimate import observer as observing
 from nnap_em.estimate.identify import begin
-from nnap_em.estimate.observer import (
-    AMBIGUOUS,
-    MISSING,
-    NO_INPUT,
-    OUTLIER,
-    RESTARTED,
-    functions,
-    observer,
-    restart_prior,
-)
+from nnap_em.estimate.observer import AMBIGUOUS, MISSING, NO_INPUT, OUTLIER, RESTARTED, functions, restart_prior
 from nnap_em.estimate.smoother.kalman import CUBATURE, ekf
 from nnap_em.estimate.smoother.mixture import alone, mixture_filter
 from nnap_em.logs.dataset import Dataset
-from nnap_em.machines.rig import read_rig
-from nnap_em.machines.systems import specs
 from nnap_em.model.base import prepare
 from nnap_em.model.effects import catalogue
 from nnap_em.model.friction import FrictionNetwork
@@ -75,12 +64,8 @@ LAWS = {
     ),
     "a servo with delay, lag, a gain from a column, learned friction": (
         (LAW["actuator_lag"].of(0.2, joint=1), LAW["input_delay"].of(0.1, joint=1)),
-        (
-            Servo(
-                "goal", "position", {k: NUMBER(v) for k, v in dict(kp=8.0, kd=1.0, delay=0.08, limit=3.0).items()},
-                (("kp", 0, 0.2),),
-            ),
-        ),
+        (Servo("goal", "position", {k: NUMBER(v) for k, v in dict(kp=8.0, kd=1.0, delay=0.08, limit=3.0).items()},
+            (("kp", 0, 0.2),)),),
         {"unknown": NETWORK},
     ),
 }  # fmt: skip
@@ -120,25 +105,6 @@ def plain():
     model = _model()
     rules = functions(model, (), restart_prior(model), 1)
     return model, _log(model), jax.jit(lambda data: _states(*rules, data))
-
-
-def test_a_linear_machine_has_its_kalman_filter(plain):
-    """x' = v, v' = u / m: matrices by hand, Joseph's form of the update."""
-    model, data, replay = plain
-    states, m, dt = replay(data), float(model.system.m), model.dt
-    a, b = np.array([[1.0, dt], [0.0, 1.0]]), np.array([dt**2 / 2, dt]) / m
-    q, r = np.diag(np.exp(model.log_q)), np.exp(model.log_r)
-    x, p = np.asarray(model.start.mean), np.asarray(model.start.cov)
-    for k in range(ROWS):
-        if k:
-            x, p = a @ x + b * data.u[k - 1, 0], a @ p @ a.T + q
-        for i in range(2):
-            if np.isfinite(data.y[k, i]):
-                gain = p[:, i] / (p[i, i] + r[i])
-                keep = np.eye(2) - np.outer(gain, np.eye(2)[i])
-                x, p = x + gain * (data.y[k, i] - x[i]), keep @ p @ keep.T + r[i] * np.outer(gain, gain)
-        np.testing.assert_allclose(states.mean[k], x, rtol=1e-9, atol=1e-12)
-        np.testing.assert_allclose(states.cov[k], p, rtol=1e-9, atol=1e-14)
 
 
 @pytest.fixture(scope="module")
@@ -224,15 +190,13 @@ CART_RIG = file_rig("cart.xml", ("x", "acc.x"), friction="none", dt=0.05) + 'noi
 def test_an_acceleration_counts_when_its_input_is_known(tmp_path):
     """One row later: in rows without an acceleration the estimate is that of the filter again.  Names are the fit's."""
     (tmp_path / "cart.xml").write_text(CART)
-    (tmp_path / "rig.toml").write_text(CART_RIG)
-    rig = read_rig(tmp_path / "rig.toml", specs)
-    t = 0.05 * np.arange(60)
+    rig, t = rig_of(tmp_path, CART_RIG), 0.05 * np.arange(60)
     u, rng = np.sin(2 * t)[:, None], np.random.default_rng(0)
     y = np.stack([0.3 * np.sin(2 * t), np.sin(2 * t) / 1.2], axis=1) + 0.05 * rng.normal(size=(60, 2))
     y[::2, 1] = np.nan
     one = jax.tree.map(jnp.asarray, Dataset(t, u, y, np.ones(60, bool)))
     fitted = begin(rig, jax.tree.map(lambda a: a[None], one), key=jax.random.key(0))
-    model, online = fitted.model, observer(fitted)
+    model, online = fitted.model, observing.observer(fitted)
     assert (online.states, online.inputs, online.measured) == (("x", "dx"), ("push",), ("x", "acc.x"))
     filtered, states = jax.jit(
         lambda data: (

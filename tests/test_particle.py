@@ -11,24 +11,16 @@ import scipy.stats
 from jaxtyping import Array, Float
 
 from nnap_em.base.gaussian import Gaussian
+from nnap_em.estimate.smoother import particle
 from nnap_em.estimate.smoother.gaussian import ExtendedKalmanSmoother
 from nnap_em.estimate.smoother.kalman import Reading, Tangent, kalman_filter
-from nnap_em.estimate.smoother.particle import (
-    Bootstrap,
-    ExactBackward,
-    Guided,
-    Lookahead,
-    ParticleSmoother,
-    Potentials,
-    ffbs,
-    particle_filter,
-)
+from nnap_em.estimate.smoother.particle import ExactBackward, Guided, ParticleSmoother, ffbs, particle_filter
 from nnap_em.estimate.smoother.particle.filter import systematic
 from nnap_em.estimate.smoother.start import StartBank
 from nnap_em.logs.dataset import Dataset, fill_missing, stepped
 from nnap_em.model.base import AbstractModel, prepare
 
-PROPOSALS = {"bootstrap": Bootstrap(), "guided": Guided(), "lookahead": Lookahead(1.0)}
+PROPOSALS = {"bootstrap": particle.Bootstrap(), "guided": Guided(), "lookahead": particle.Lookahead(1.0)}
 SEEDS, PARTICLES, PATHS = 100, 200, 40
 KEY = jax.random.key(5)
 
@@ -205,7 +197,7 @@ def test_weights_of_the_blind_filter_by_hand():
     """Every weight is the old one, or 1 / N after a resampling, times the density of the reading."""
     model, seq = _linear()
     n, rows = 40, seq.t.shape[0]
-    blind = Potentials(jnp.zeros((rows, 2)), jnp.zeros((rows, 2, 2)), jnp.zeros((rows, 2)))
+    blind = particle.Potentials(jnp.zeros((rows, 2)), jnp.zeros((rows, 2, 2)), jnp.zeros((rows, 2)))
     run = eqx.filter_jit(lambda m, s, key: particle_filter(m, blind, s, num_particles=n, key=key, dtype=float))
     h = run(model, prepare(model, seq), jax.random.key(6))
     x, f = (np.asarray(h.scale)[:, None] * np.asarray(a) for a in (h.x, h.f))
@@ -241,7 +233,7 @@ def _escape(start):
     y = np.where((t > 0.25) & (t < 1.25), np.nan, 0.0)[:, None]
     seq = Dataset(*map(jnp.asarray, (t, np.zeros((16, 1)), y, np.ones(16, bool))))
     path, zero = jnp.zeros((16, 1)), jnp.zeros((16, 1, 1))
-    return model, seq, Potentials(path, zero, path)
+    return model, seq, particle.Potentials(path, zero, path)
 
 
 @eqx.filter_jit

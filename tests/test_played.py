@@ -11,12 +11,10 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from helpers import file_rig, optimised, rate
+from helpers import file_rig, optimised, rate, rig_of
 
 from nnap_em.estimate.identify import Identified, begin
 from nnap_em.logs.dataset import Dataset
-from nnap_em.machines.rig import read_rig
-from nnap_em.machines.systems import specs
 from nnap_em.model.effects import catalogue
 from nnap_em.model.effects.function import Axis, UnknownFunction
 from nnap_em.model.state_space import with_effects
@@ -39,8 +37,7 @@ def bare(tmp_path_factory) -> tuple[Identified, Dataset]:
     """A fit without laws, and its log."""
     folder = tmp_path_factory.mktemp("bare")
     (folder / "two.xml").write_text(CART)
-    (folder / "rig.toml").write_text(RIG)
-    rig, rng, t = read_rig(folder / "rig.toml", specs), np.random.default_rng(0), 0.01 * np.arange(ROWS)
+    rig, rng, t = rig_of(folder, RIG), np.random.default_rng(0), 0.01 * np.arange(ROWS)
     tones = [np.sin(2 * np.pi * rng.uniform(0.3, 1.8, (4, 1)) * t + rng.uniform(0, 6.28, (4, 1))) for _ in range(2)]
     u = np.stack([size * 1.5 * tone.mean(axis=0) for size, tone in zip((6.0, 0.4), tones, strict=True)], axis=-1)
     data = Dataset(t[None], u[None], np.stack([np.sin(3 * t), np.cos(2 * t)], -1)[None], np.ones((1, ROWS), bool))

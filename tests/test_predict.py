@@ -23,17 +23,6 @@ KEY = jax.random.key(1)
 PHYSICS = {"m": 0.5, "lc": 0.2, "I": 0.002, "g": 9.81}
 
 
-def _rig(friction: bool = True) -> Rig:
-    parameters = {k: Declared(v, 0.05 * v if k == "m" else 0.0) for k, v in PHYSICS.items()}
-    return Rig("p", "pendulum", parameters, friction, ("u",), (1,), DT, "sequence", ("theta1",), {"theta1": 1e-3}, {})
-
-
-def _logs(model: StateSpaceModel) -> tuple[Dataset, jax.Array]:
-    x0 = jnp.asarray([[0.5, 1.0], [-1.0, 0.3], [2.0, -3.0]])
-    u = 0.2 * jnp.sin(jnp.arange(float(ROWS)) * DT * 6)[None, :, None] * jnp.ones((3, 1, 1))
-    return simulate(model, x0, u, key=jax.random.key(2), substeps=model.substeps)
-
-
 class _Case(NamedTuple):
     fitted: Identified
     data: Dataset
@@ -44,7 +33,9 @@ class _Case(NamedTuple):
 def _begun() -> Identified:
     blank = Dataset(*(jnp.zeros((1, 9, *s)) for s in ((), (1,), (1,))), jnp.ones((1, 9), bool))
     y = 0.3 * jnp.sin(jnp.arange(9.0))[None, :, None]
-    return begin(_rig(), blank._replace(y=y, u=0 * y + 0.2), key=jax.random.key(0))
+    numbers = {k: Declared(v, 0.05 * v if k == "m" else 0.0) for k, v in PHYSICS.items()}
+    rig = Rig("p", "pendulum", numbers, True, ("u",), (1,), DT, "sequence", ("theta1",), {"theta1": 1e-3}, {})
+    return begin(rig, blank._replace(y=y, u=0 * y + 0.2), key=jax.random.key(0))
 
 
 @functools.cache
@@ -58,7 +49,9 @@ def _case(q: float, information: float) -> _Case:
     problem = _begun()
     unknown = eqx.tree_at(lambda f: (f.speed, f.knee), problem.model.unknown, (jnp.asarray([8.0]), jnp.asarray([0.1])))
     model = StateSpaceModel(system, unknown, start, noise, 2 * jnp.log(jnp.asarray([1e-3])), (0,), DT)
-    data, x = _logs(model)
+    x0 = jnp.asarray([[0.5, 1.0], [-1.0, 0.3], [2.0, -3.0]])
+    u = 0.2 * jnp.sin(jnp.arange(float(ROWS)) * DT * 6)[None, :, None] * jnp.ones((3, 1, 1))
+    data, x = simulate(model, x0, u, key=jax.random.key(2), substeps=model.substeps)
     hessian = (information * problem.m_step.weights(model).prior_precision(unknown)).at[-1, -1].set(1e20)
     return _Case(problem._replace(state=problem.state._replace(model=model, best=model, hessian=hessian)), data, x)
 

@@ -63,12 +63,8 @@ def test_noise_gaps_and_too_little_data_show_no_lag():
 
 
 def test_the_sentence_has_the_later_one_and_what_to_do():
-    said = (
-        "dx is the derivative of x, ",
-        "dx is 0.04 s (2 rows) later than the",
-        "x is 0.04 s (2 rows) later than dx; ",
-    )
-    for late, start in zip((0.0, 0.04, -0.04), said, strict=True):
+    later = "is 0.04 s (2 rows) later than"
+    for late, start in ((0.0, "dx is the derivative of x, "), (0.04, f"dx {later} the"), (-0.04, f"x {later} dx; ")):
         y, valid = np.stack(_read(_motion(1, late)), axis=-1), np.ones((COUNT, ROWS), bool)
         (found,) = rates(RIG, Dataset(np.tile(T, (COUNT, 1)), np.zeros((COUNT, ROWS, 1)), y, valid))
         assert found.text.startswith(start)

@@ -8,22 +8,8 @@ import h5py
 import numpy as np
 import pytest
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
-from mcap.writer import CompressionType
-from recorders import (
-    EPOCH,
-    FLOAT,
-    JOINTS,
-    MULTI,
-    NO_INDEX,
-    NS,
-    arrays,
-    joint_states,
-    ns,
-    plain_json,
-    ros2,
-    write_hdf5,
-    write_mcap,
-)
+from mcap.writer import CompressionType, IndexType
+from recorders import EPOCH, JOINTS, MULTI, NS, arrays, joint_states, ns, plain_json, ros2, write_hdf5, write_mcap
 from rosbags import rosbag1, rosbag2
 from rosbags.typesys import Stores, get_typestore
 
@@ -45,12 +31,17 @@ def _log(path, **options):
     topics = {
         "/js": (ros2(*JOINTS), ns(T), joints),
         "/cmd": (ros2(*MULTI), ns(T + 0.001), arrays(U)),
-        "/rest": (ros2("std_msgs/msg/Float64", FLOAT), ns(T), (SimpleNamespace(data=1.0) for _ in T)),
+        "/rest": (ros2("std_msgs/msg/Float64", "float64 data\n"), ns(T), (SimpleNamespace(data=1.0) for _ in T)),
     }
     return write_mcap(path, topics, **options)
 
 
-LAYOUTS = {"zstd": {}, "no index, no summary": NO_INDEX, "channels once": {"repeat_channels": False}}
+WHOLE = ("repeat_channels", "repeat_schemas", "use_statistics", "use_summary_offsets")
+LAYOUTS = {
+    "zstd": {},
+    "no index, no summary": dict.fromkeys(WHOLE, False) | {"index_types": IndexType.NONE},
+    "channels once": {"repeat_channels": False},
+}
 
 
 @pytest.mark.parametrize("options", LAYOUTS.values(), ids=LAYOUTS)
@@ -175,11 +166,6 @@ def test_hdf5_finds_its_time_axis(tmp_path, name, made, attributes):
     np.testing.assert_allclose((track.t - track.t[0]) * 1e-9, T, rtol=0, atol=2e-9)  # ns, rounded twice
 
 
-def _stamped(path, stamps, log=None):
-    log = ns(T) if log is None else log
-    return write_mcap(path, {"/js": (ros2(*JOINTS), log, joint_states(("a",), Q[:, :1], stamps=stamps))})
-
-
 CLOCKS = {  # header stamps, the clock that is taken, and what is said
     "there": (ns(T - 0.01), "header stamp", ""),
     "all 0": (0 * ns(T), "log time", "header stamps are all 0"),
@@ -190,7 +176,8 @@ CLOCKS = {  # header stamps, the clock that is taken, and what is said
 
 @pytest.mark.parametrize("stamps, clock, note", CLOCKS.values(), ids=CLOCKS)
 def test_which_clock_is_taken_and_why(tmp_path, stamps, clock, note):
-    track = _read(_stamped(tmp_path / "a.mcap", stamps), js=("position[a]",))["/js"]
+    joints = ros2(*JOINTS), ns(T), joint_states(("a",), Q[:, :1], stamps=stamps)
+    track = _read(write_mcap(tmp_path / "a.mcap", {"/js": joints}), js=("position[a]",))["/js"]
     assert track.clock == clock and note in "".join(track.notes)
     assert (np.diff(track.t) > 0).all() and bool(track.notes) == bool(note)
 
@@ -216,15 +203,12 @@ def _flipped(path):
     return path
 
 
-def _unread(path, encoding="flatbuffer", form="bfbs"):
-    schema = ("robot.State", form, b"...", encoding, lambda message: message)
-    return write_mcap(path, {"/js": (schema, ns(T), [b"1234"] * 300)})
-
-
 BAD = {  # the file, what writes it, and words of the message
     "no MCAP file": ("a.mcap", lambda p: p.write_text("hello, world"), "no MCAP file"),
     "a changed bit": ("a.mcap", _flipped, "damaged (crc validation failed | another copy"),
-    "unknown encoding": ("a.mcap", _unread, "'/js' | in 'flatbuffer' | are not read | JSON or protobuf"),
+    "unknown encoding": ("a.mcap", lambda p: write_mcap(p, {"/js": (
+        ("robot.State", "bfbs", b"...", "flatbuffer", lambda m: m), ns(T), [b"1234"] * 300)}),
+        "'/js' | in 'flatbuffer' | are not read | JSON or protobuf"),
     "no JSON": ("a.mcap", lambda p: write_mcap(p, {"/js": ((*plain_json()[:4], lambda m: m), ns(T),
         [b'{"q": 1'] * 300)}),
         "'/js' | does not fit its schema (Expecting | write it as"),

@@ -108,14 +108,11 @@ def test_a_sensor_that_is_stuck_or_dies_is_found_by_what_the_other_says(name, le
         assert set(range(first, end)) <= rows <= set(range(first - 1, end))
 
 
-def test_a_column_alone_is_stuck_where_it_wakes_up_elsewhere():
+def test_a_column_alone_is_stuck_where_it_wakes_up_elsewhere_or_its_noise_is_gone():
+    """About the top of a sine it wakes up where it stood; without noise it is a joint that rests."""
     alone = _motion(5)["theta1"]
     alone[151:201] = alone[150]
     assert _faults({"theta1": alone}) == {("stuck", "theta1"): set(range(151, 201))}
-
-
-def test_a_column_alone_is_stuck_where_its_noise_is_gone():
-    """About the top of a sine, where it wakes up where it stood; without noise it is a joint that rests."""
     for noise, found in ((0.005, {("stuck", "theta1"): set(range(101, 210))}), (0.0, {})):
         alone = np.sin(np.pi * np.arange(311) / 310) + noise * np.random.default_rng(0).standard_normal(311)
         alone[101:210] = alone[100]

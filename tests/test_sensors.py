@@ -61,10 +61,6 @@ ARM = arm(3).replace('<site name="hand" pos="0 0 0.05"/>', '<site name="hand" po
 ARM = ARM.replace("</actuator>", f"</actuator><sensor>{_wired(['hand'])}</sensor>")
 
 
-def _columns(sites) -> list[str]:
-    return [f"{site}_{kind}.{axis}" for site in sites for kind in KINDS for axis in "xyz"]
-
-
 def _rig(folder: Path, text: str, columns, rest: str = "", model: str = "") -> Path:
     (folder / "machine.xml").write_text(text)
     (folder / "rig.toml").write_text(file_rig("machine.xml", columns, model) + rest)
@@ -87,27 +83,22 @@ def _model(system, measured) -> StateSpaceModel:
 
 
 def test_readings_are_those_of_mujoco_under_torque_and_friction(tmp_path):
-    text, columns = _branch(), _columns(BRANCH)
+    text = _branch()
+    columns = [f"{site}_{kind}.{axis}" for site in BRANCH for kind in KINDS for axis in "xyz"]
     ours = _model(build_system(read_rig(_rig(tmp_path, text, columns), specs)), columns)
     model = mujoco.MjModel.from_xml_string(text)
     model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
     address = {model.sensor(i).name: int(model.sensor_adr[i]) for i in range(model.nsensor)}
     rng = np.random.default_rng(0)
     x, u = rng.uniform(-3.0, 3.0, (6, 2 * model.nv)), rng.uniform(-2.0, 2.0, (6, model.nu))
-    read = jax.jit(
-        lambda x, u: jax.lax.map(lambda a: (ours.emission(a[0], Inputs.held(a[1])), _rubs(ours, a[0])), (x, u))
-    )
-    for state, push, seen, rubs in zip(x, u, *read(x, u), strict=True):
+    read = lambda a: (ours.emission(a[0], Inputs.held(a[1])), ours.unknown(a[0][model.nv :]))  # noqa: E731
+    for state, push, seen, rubs in zip(x, u, *jax.jit(lambda x, u: jax.lax.map(read, (x, u)))(x, u), strict=True):
         data = mujoco.MjData(model)
         data.qpos[:], data.qvel[:] = np.split(state, 2)
         data.ctrl[:], data.qfrc_applied[:] = push, rubs
         mujoco.mj_forward(model, data)
         truth = [data.sensordata[address[c[:-2]] + "xyz".index(c[-1])] for c in columns]
         np.testing.assert_allclose(seen, truth, rtol=1e-10, atol=1e-10)
-
-
-def _rubs(model, x):
-    return model.unknown(x[len(x) // 2 :])
 
 
 # --- what a fit makes of them

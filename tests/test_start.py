@@ -11,26 +11,18 @@ from nnap_em.logs.dataset import Dataset
 from nnap_em.machines.rig import Declared
 from nnap_em.model.simulate import declared, examples, paper_model
 
-KEY = jax.random.key(0)
 LATE, ROWS = 30, 96
 
 
-def _swung(model, late: int = 0) -> Dataset:
-    """Logs of any motion, whose sensors start `late` rows late."""
-    t = model.dt * np.arange(ROWS)
+def _counts(name: str, model, late: int, **start: Declared) -> list[int]:
+    """Number of hypotheses along each state, of logs of any motion whose sensors start `late` rows late."""
+    rig, t = declared(name, model), model.dt * np.arange(ROWS)
     y = np.sin(5 * t + np.arange(3.0)[:, None])[..., None] + np.arange(float(len(model.measured)))
     y[:, :late] = np.nan
     t = np.broadcast_to(t, y.shape[:2])
-    return Dataset(*map(jnp.asarray, (t, np.cos(3 * t)[..., None], y, np.ones(t.shape, bool))))
-
-
-def _counts(name: str, model, late: int, **start: Declared) -> list[int]:
-    """Number of hypotheses along each state."""
-    rig = declared(name, model)
-    offsets = np.asarray(
-        build(dataclasses.replace(rig, start=rig.start | start), _swung(model, late), key=KEY).bank.offsets
-    )
-    return [len(np.unique(column)) for column in offsets.T]
+    data = Dataset(*map(jnp.asarray, (t, np.cos(3 * t)[..., None], y, np.ones(t.shape, bool))))
+    bank = build(dataclasses.replace(rig, start=rig.start | start), data, key=jax.random.key(0)).bank
+    return [len(np.unique(column)) for column in np.asarray(bank.offsets).T]
 
 
 def test_an_angle_that_is_read_late_has_hypotheses():

@@ -35,15 +35,12 @@ def _arm(p, q):
     return list(zip((p["m1"], p["m2"]), centres, strict=True)), turning
 
 
-def _swing(p, q):
-    return [(p["m"], p["lc"] * jnp.stack([jnp.sin(q[0]), -jnp.cos(q[0])]))], [(p["I"], q[0])]
-
-
-def _slide(p, q):
-    return [(p["m"], jnp.stack([q[0], jnp.zeros(())]))], []
-
-
-BODIES = {"acrobot": _arm, "pendubot": _arm, "pendulum": _swing, "slide": _slide}
+BODIES = {
+    "acrobot": _arm,
+    "pendubot": _arm,
+    "pendulum": lambda p, q: ([(p["m"], p["lc"] * jnp.stack([jnp.sin(q[0]), -jnp.cos(q[0])]))], [(p["I"], q[0])]),
+    "slide": lambda p, q: ([(p["m"], jnp.stack([q[0], jnp.zeros(())]))], []),
+}
 
 
 def _energies(name: str, q, v):
@@ -57,10 +54,6 @@ def _energies(name: str, q, v):
     kinetic = sum(0.5 * m * jnp.sum(w**2) for (m, _), w in zip(masses, velocities, strict=True))
     kinetic = kinetic + sum(0.5 * i * w**2 for (i, _), w in zip(turning, rates, strict=True))
     return kinetic, sum(m * p.get("g", 0.0) * position[1] for m, position in masses)
-
-
-def _energy(name: str, x):
-    return sum(_energies(name, *jnp.split(x, 2)))
 
 
 def _states(name: str, count: int = 20):
@@ -101,7 +94,7 @@ def test_energy_changes_by_the_work_of_the_input(name):
 
     def powers(x):
         rates = [model.rate(x, u, jnp.zeros(x.shape[0] // 2)) for model in models]
-        return [jax.jvp(lambda x: _energy(name, x), (x,), (rate,))[1] for rate in rates]
+        return [jax.jvp(lambda x: sum(_energies(name, *jnp.split(x, 2))), (x,), (rate,))[1] for rate in rates]
 
     q, v = _states(name, 4)
     driven = v[:, INPUTS[name][0] - 1] * u.u[0]

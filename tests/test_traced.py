@@ -113,10 +113,6 @@ def test_what_decides_a_program_makes_another(cache, work, monkeypatch, other):
         _same(changed, _done(OTHERS[other](work), monkeypatch))
 
 
-def _own(common, one):
-    return common * one
-
-
 def _called_back(common, one):
     return jax.pure_callback(lambda x: 2 * x, jax.ShapeDtypeStruct((), one.dtype), one, vmap_method="sequential")
 
@@ -129,7 +125,8 @@ def test_what_a_key_cannot_tell_or_a_file_cannot_hold_runs_all_the_same(cache, w
     """A function of another package may say something else tomorrow; so may a closure."""
     numbers = jnp.arange(3.0)
     for factor in (2.0, 3.0):
-        np.testing.assert_array_equal(parallel.each(_own, jnp.asarray(factor), numbers), factor * np.arange(3.0))
+        scaled = parallel.each(lambda common, one: common * one, jnp.asarray(factor), numbers)
+        np.testing.assert_array_equal(scaled, factor * np.arange(3.0))
     np.testing.assert_array_equal(parallel.each(_called_back, None, numbers), [0.0, 2.0, 4.0])
     with pytest.raises(ZeroDivisionError, match="told by the function"):
         parallel.each(_wrong, None, numbers)

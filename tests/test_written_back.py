@@ -12,8 +12,9 @@ import machine_files
 import mujoco
 import numpy as np
 import pytest
-from helpers import file_rig
+from helpers import file_rig, rig_of
 from machine_files import CASES, DT, FINE, errors, friction, recorded
+from machines import physics
 
 from nnap_em import identify
 from nnap_em.errors import ExportError
@@ -80,22 +81,12 @@ def test_a_model_is_loaded_and_exported_without_the_file_and_mujoco(uncertain, t
 # --- written back
 
 
-def _physics(model: mujoco.MjModel, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    data = mujoco.MjData(model)
-    data.qpos[:], data.qvel[:] = q, v
-    mujoco.mj_forward(model, data)
-    mass = np.zeros((model.nv, model.nv))
-    mujoco.mj_fullM(model, data, mass)
-    return mass, data.qfrc_bias - data.qfrc_spring
-
-
 def _of_file(folder: Path, file: str, more: str, effects=()) -> tuple[Machine, Identified]:
     """A machine of `machines/`, and a fit of it before its first epoch, its first joint read and driven."""
     (folder / file).write_text((Path(__file__).parent / "machines" / file).read_text())
     machine = read_machine(folder / file)
-    text = file_rig(file, [machine.joints[0].name], more, friction="none")
-    (folder / "rig.toml").write_text(text)
-    rig, t = read_rig(folder / "rig.toml", specs), 0.01 * np.arange(30.0)
+    rig = rig_of(folder, file_rig(file, [machine.joints[0].name], more, friction="none"))
+    t = 0.01 * np.arange(30.0)
     logs = machine_files.Dataset(t[None], np.sin(t)[None, :, None], np.sin(t)[None, :, None], np.ones((1, 30), bool))
     return machine, begin(rig, logs, key=jax.random.key(0), effects=effects)
 
@@ -121,7 +112,7 @@ def test_a_written_machine_is_the_same_in_mujoco(tmp_path, file, servo, left):
     states = np.random.default_rng(0).uniform(-2.0, 2.0, (3, len(joints)))
     forces = jax.jit(lambda states: jax.lax.map(lambda q: (system.mass(q), system.bias(q, 0.0 * q)), states))
     for q, mass, bias in zip(states, *forces(states), strict=True):
-        other, force = _physics(written, q, 0.0 * q)
+        (other,), (force,) = physics(written, [(q, 0.0 * q)])
         np.testing.assert_allclose(other, mass, rtol=1e-9, atol=1e-9)
         np.testing.assert_allclose(force, bias, atol=1e-8)
     np.testing.assert_allclose(written.dof_damping, [joint.damping for joint in machine.joints])
@@ -158,7 +149,7 @@ def test_a_urdf_file_is_written_again_with_the_numbers_of_the_fit(tmp_path, part
     for q in np.random.default_rng(0).uniform(-1.0, 1.0, (3, 3)):
         q[2] = 0.1 if part else q[2]
         mass, weight = jax.jit(lambda q: (system.mass(q), system.bias(q, 0.0 * q)))(q[:dof])
-        other, force = _physics(model, q, 0.0 * q)
+        (other,), (force,) = physics(model, [(q, 0.0 * q)])
         np.testing.assert_allclose(other[:dof, :dof] + np.diag([0.0, 0.2, 0.0][:dof]), mass, rtol=1e-9, atol=1e-9)
         np.testing.assert_allclose(force[:dof], weight, rtol=1e-9, atol=1e-9)
 
@@ -205,9 +196,9 @@ def test_a_written_file_is_that_of_its_owner(tmp_path):
         np.testing.assert_allclose(getattr(other, field), getattr(one, field), rtol=1e-13, atol=1e-13)
     np.testing.assert_allclose([other.dof_armature, other.dof_damping], [[0.0123456789012] * 2, [0.3] * 2], rtol=1e-14)
     assert [other.geom(i).name for i in range(other.ngeom)] == ["floor", "tube", "shell"]
-    for q, v in np.random.default_rng(0).uniform(-3.0, 3.0, (5, 2, 2)):
-        for ours, theirs in zip(_physics(other, q, v), _physics(one, q, v), strict=True):
-            np.testing.assert_allclose(ours, theirs, rtol=1e-12, atol=1e-12)
+    states = np.random.default_rng(0).uniform(-3.0, 3.0, (5, 2, 2))
+    for ours, theirs in zip(physics(other, states), physics(one, states), strict=True):
+        np.testing.assert_allclose(ours, theirs, rtol=1e-12, atol=1e-12)
 
 
 def test_a_fit_that_has_no_machine_file_is_refused(uncertain, tmp_path):

@@ -853,8 +853,8 @@ a law from one start
 + near = [law]
 ## test_search.py::test_a_round[a refit shows what is left]
 forms of a law that remove nearly all explain the same
-- [-math.log1p(-value) for value in values], model
-+ values, model
+- admissible, _gone(values), model
++ admissible, values, model
 # model/effects/base.py
 ## test_inputs.py::test_what_is_not_seen_to_repeat_has_no_periods
 a bump is a cogging

@@ -107,8 +107,8 @@ def decided(
             tried += [refitted(_forms(s, fresh)) for s in group]
             admitted = [s for s in admitted if not any(s is other for other in group)]
             possible, left = [case for case in tried if case.rejection is None], _band(admitted, group[0].band)
-            removed = max(_worths(possible, [case.removed for case in possible], model), default=0.0)
-            if removed > EXCEEDS * max(_worths(left, [s.share.least for s in left], model), default=0.0):
+            removed = max(_worths(possible, _gone([case.removed for case in possible]), model), default=0.0)
+            if removed > EXCEEDS * max(_worths(left, _gone([s.share.least for s in left]), model), default=0.0):
                 break
     except TimeUp:
         complete = False
@@ -139,17 +139,22 @@ def _band(laws: Sequence[Screened], band: int) -> list[Screened]:
     return [s for s in laws if s.band == band]
 
 
+def _gone(shares: Sequence[float]) -> list[float]:
+    """Log of the error without laws over that with them: where nearly all goes what is left counts."""
+    return [-math.log1p(-share) for share in shares]
+
+
 def _accepted(
     admissible: list[Trial], step: Step, model: StateSpaceModel, context: SearchContext
 ) -> tuple[Step, tuple[Trial, tuple[Key, ...]] | None]:
     """Choose among refitted laws: the simplest at the place that is worth most, in its simplest form. None where one
     that is worth as much is of another cause, nor a free function where no error rose since a fit. Forms of a law are
-    compared by the log of the error without one over that with it: where nearly all goes the rest counts.
+    compared by what they leave.
     """
     values = [case.removed for case in admissible]
     worths = _worths(admissible, values, model)
     leader = admissible[simplest(worths, _complexities(admissible, model), values)]
-    best = _form(leader, admissible, [-math.log1p(-value) for value in values], model)
+    best = _form(leader, admissible, _gone(values), model)
     law = best.candidate.start
     tied = [case for case in (admissible[i] for i in even(worths)) if case is not leader]
     rivals = [case for case in tied if other_cause(case.effect, law, model.system)]

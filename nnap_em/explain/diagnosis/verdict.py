@@ -33,8 +33,8 @@ EQUIVALENT = 0.9
 """Share of the best from which on a law explains the same: a simpler law is then preferred to one that contains it,
 refits decide between others, and between laws of different causes the question stays open."""
 EXCEEDS = 1.5
-"""Share that a refit removes over the screened one: of 82 accepted laws on real arms eight of ten lie below, half below
-1.1. No law is accepted before all that may remove more are refitted."""
+"""Log of the error without a law over that with it, after a refit over that of the screen: of 89 accepted laws on real
+arms seven of ten lie below. No law is accepted before all that may remove more are refitted."""
 WORSE = 2.0
 """Multiple of the squared error of a reading at some age from which on laws of equations harm it: heat from one real
 heater to the other makes it 1.3 times as large beside what else lacks, a wrong law on a ship 20 and 56 times."""

@@ -775,8 +775,8 @@ a column of the nuisance is a candidate
 # explain/diagnosis/context.py
 ## test_search.py::test_a_search_begins_at_the_whole_length_unless_most_sequences_are_lost_there
 a search with a hidden joint begins where friction has taken the law
-- [*growing[-1:], longest]
-+ [longest]
+- else growing[-1:]), longest]
++ else ()), longest]
 ## test_search.py::test_the_fit_of_the_least_error_is_kept_the_likelier_of_near_ones_and_none_that_predicts_worse
 a fit that predicts worse is kept
 - if min(left) > 1:
@@ -795,8 +795,8 @@ a free function is a change whatever the errors
 + True
 ## test_search.py::test_a_round[a refit removes less]
 the first law that a refit leaves is accepted
-- removed > EXCEEDS * max(
-+ removed > 0 * max(
+- > EXCEEDS * _largest(
++ > 0 * _largest(
 ## test_search.py::test_a_round[even after the refit too]
 the weakest of even laws leads
 - simplest(worths, _complexities(admissible, model), values)
@@ -853,7 +853,7 @@ a law from one start
 + near = [law]
 ## test_search.py::test_a_round[a refit shows what is left]
 forms of a law that remove nearly all explain the same
-- admissible, _gone(values), model
+- admissible, reductions(values), model
 + admissible, values, model
 # model/effects/base.py
 ## test_inputs.py::test_what_is_not_seen_to_repeat_has_no_periods

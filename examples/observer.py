@@ -24,6 +24,7 @@ from matplotlib.figure import Figure
 import nnap_em
 from nnap_em.base.programs import use_older_emitters
 from nnap_em.estimate.observer import Observer
+from nnap_em.output.export import write_observer
 
 STIFFNESS, DAMPING, MOST = 1.5, 0.12, 0.8
 """Gains of the controller [N m/rad, N m s/rad], and its largest torque [N m]."""
@@ -103,7 +104,7 @@ def main() -> int:
     rig = nnap_em.read_rig(args.out / "rig" / "rig.toml")
     fitted = nnap_em.identify(rig, nnap_em.read_logs(args.out / "rig" / "train", rig).data, key=jax.random.key(0))
     nnap_em.save(args.out / "fit" / "model.npz", fitted)
-    nnap_em.output.export.write_observer(fitted, args.out / "arm.c")
+    write_observer(fitted, args.out / "arm.c")
     online = nnap_em.observer(fitted)
     runs = {
         name: closed_loop(case, online, args.seconds, args.seed, reads)

@@ -1,7 +1,7 @@
 """Identify what a physics model of a machine does not know, from logs, and find what it lacks.
 
-The main jobs are functions of the package; the rest is in `machines`,
-`estimate`, `output` and `errors`.  Each name is loaded at its first use, so that `import nnap_em` costs nothing.
+The main jobs are functions of the package; the rest is in `machines`, `estimate`, `output` and `errors`.  Each name is
+loaded at its first use, so that `import nnap_em` costs nothing.
 """
 
 import importlib

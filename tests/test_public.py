@@ -20,9 +20,8 @@ import nnap_em
 
 TOP = {name: getattr(nnap_em, name) for name in nnap_em.__all__}
 WINGS = {name: value for name, value in TOP.items() if isinstance(value, ModuleType)}
-ROOMS = {n: w for n, w in WINGS.items() if n != "output"} | {
-    f"output.{n}": getattr(WINGS["output"], n) for n in WINGS["output"].__all__
-}
+ROOMS = {name: wing for name, wing in WINGS.items() if name != "output"}
+ROOMS |= {f"output.{name}": importlib.import_module(f"nnap_em.output.{name}") for name in ("export", "plots")}
 FUNCTIONS = {
     f"{room}.{name}".removeprefix("nnap_em."): getattr(home, name)
     for room, home in ({"nnap_em": nnap_em} | ROOMS).items()

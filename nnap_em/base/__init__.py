@@ -1,1 +1,1 @@
-"""Arrays, whole files, devices, the journal of a long run: what every other wing stands on."""
+"""Arrays, whole files, devices and the journal of a long run, which all other wings use."""

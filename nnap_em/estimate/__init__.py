@@ -1,4 +1,4 @@
-"""What is inferred: states, friction, numbers and noise, from a `Rig` and a `Dataset`; what a fit predicts.
+"""Inference: a `Rig` and a `Dataset` give states, friction, numbers and noise; a fit gives predictions.
 
 Smoothers, for `identify(..., smoother=...)`, are each made from the hypotheses of the start of a fit. With options one
 is a function, `lambda bank: ParticleSmoother(CubatureSmoother(bank), num_particles=1000)`.

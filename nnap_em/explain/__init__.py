@@ -1,1 +1,1 @@
-"""What is missing: checks of logs, the search for effects, comparison of fits, the next experiment."""
+"""Explanation of what a model leaves: checks of logs, search for effects, comparison of fits, design of experiments."""

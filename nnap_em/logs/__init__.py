@@ -1,1 +1,1 @@
-"""What was recorded: log files in, a padded `Dataset` out; import from recorders, and first drafts of a rig.toml."""
+"""Recordings: log files give a padded `Dataset`; importers give log files, drafts a first `rig.toml`."""

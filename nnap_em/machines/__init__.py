@@ -1,4 +1,4 @@
-"""What is declared: `rig.toml`, an MJCF or URDF file, or equations in; a `Rig` and its equations of motion out."""
+"""Declarations: `rig.toml`, an MJCF or URDF file, or equations give a `Rig` and its equations of motion."""
 
 from .systems import AbstractPlant, AbstractSystem, Equations, register, register_equations, root, specs
 

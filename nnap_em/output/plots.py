@@ -28,7 +28,8 @@ def friction(fitted: Identified) -> Figure:
         The figure, a panel for each joint.
 
     Example:
-        >>> len(nnap_em.output.plots.friction(fit).axes)
+        >>> from nnap_em.output import plots
+        >>> len(plots.friction(fit).axes)
         1
     """
     table = friction_table(fitted, fitted.m_step.weights(fitted.model).nodes)
@@ -49,7 +50,8 @@ def prediction(fitted: Identified, data: Dataset, given: float, *, key: PRNGKeyA
         The figure, a panel for each state: its mean, its band of two standard deviations and its readings.
 
     Example:
-        >>> len(nnap_em.output.plots.prediction(fit, test, 0.5, key=key).axes)
+        >>> from nnap_em.output import plots
+        >>> len(plots.prediction(fit, test, 0.5, key=key).axes)
         2
     """
     one = jax.tree.map(lambda a: a[sequence : sequence + 1], data)
@@ -67,7 +69,8 @@ def residual(fitted: Identified, data: Dataset) -> Figure:
         The figure, a row of panels for each joint, headed by the share of variance that its cause accounts for.
 
     Example:
-        >>> len(nnap_em.output.plots.residual(fit, test).axes) > 1
+        >>> from nnap_em.output import plots
+        >>> len(plots.residual(fit, test).axes) > 1
         True
     """
     return residual_figure(residual_of(fitted, data), names_of(fitted))

@@ -65,16 +65,16 @@ def lengths_of(context: SearchContext) -> list[int]:
     """Rows of the first rounds: all, or if most sequences diverge before, as many as most keep. Where a joint is hidden
     they begin along the growing fit, in which noise and friction are not yet free to take a law for their own: at the
     last horizon before the whole length, where a spring at a joint of a real arm that no sensor reads removes half of
-    the error, and over the whole length 0.03; where readings are white at the two shortest, and one in the middle: on a
-    simulated arm a spring explains 0.38 of the error over 0.6 s, less than 0.09 over 5 s.
+    the error, and no law more than 0.03 over the whole length; where readings are white at the two shortest, and one in
+    the middle: on a simulated arm a spring explains 0.38 of the error over 0.6 s, less than 0.09 over 5 s; on real arms
+    those name wrong laws.
     """
     longest = context.longest
     growing = [length for length in sorted(context.stages) if length < longest]
-    if context.before.model.hides and context.white:
-        middle = [length for length in growing if longest / 3 < length < 0.7 * longest]
-        return [*dict.fromkeys([length for length in growing if length <= SHORT][:2] + middle[:1]), longest]
     if context.before.model.hides:
-        return [*growing[-1:], longest]
+        middle = [length for length in growing if longest / 3 < length < 0.7 * longest]
+        short = [length for length in growing if length <= SHORT][:2] + middle[:1]
+        return [*dict.fromkeys(short if context.white else growing[-1:]), longest]
     followed = {length: np.mean(used) for length, (_, used) in context.stages.items()}
     most = [length for length, share in followed.items() if share >= FOLLOWED]
     first = max(most, default=min(followed, default=longest))

@@ -107,8 +107,8 @@ def decided(
             tried += [refitted(_forms(s, fresh)) for s in group]
             admitted = [s for s in admitted if not any(s is other for other in group)]
             possible, left = [case for case in tried if case.rejection is None], _band(admitted, group[0].band)
-            removed = max(_worths(possible, _gone([case.removed for case in possible]), model), default=0.0)
-            if removed > EXCEEDS * max(_worths(left, _gone([s.share.least for s in left]), model), default=0.0):
+            removed = _largest(possible, [case.removed for case in possible], model)
+            if removed > EXCEEDS * _largest(left, [s.share.least for s in left], model):
                 break
     except TimeUp:
         complete = False
@@ -139,9 +139,13 @@ def _band(laws: Sequence[Screened], band: int) -> list[Screened]:
     return [s for s in laws if s.band == band]
 
 
-def _gone(shares: Sequence[float]) -> list[float]:
-    """Log of the error without laws over that with them: where nearly all goes what is left counts."""
+def reductions(shares: Sequence[float]) -> list[float]:
+    """Logs of the error without laws over that with them, by shares that go: where nearly all goes the rest counts."""
     return [-math.log1p(-share) for share in shares]
+
+
+def _largest(laws: Sequence[_Law], shares: Sequence[float], model: StateSpaceModel) -> float:
+    return max(_worths(laws, reductions(shares), model), default=0.0)
 
 
 def _accepted(
@@ -154,7 +158,7 @@ def _accepted(
     values = [case.removed for case in admissible]
     worths = _worths(admissible, values, model)
     leader = admissible[simplest(worths, _complexities(admissible, model), values)]
-    best = _form(leader, admissible, _gone(values), model)
+    best = _form(leader, admissible, reductions(values), model)
     law = best.candidate.start
     tied = [case for case in (admissible[i] for i in even(worths)) if case is not leader]
     rivals = [case for case in tied if other_cause(case.effect, law, model.system)]

@@ -27,7 +27,8 @@ def write_model(fitted: Identified, out: Path | str) -> None:
         ExportError: its inputs are commands of servos; nothing is written.
 
     Example:
-        >>> nnap_em.output.export.write_model(fit, f"{folder}/plain")
+        >>> from nnap_em.output import export
+        >>> export.write_model(fit, f"{folder}/plain")
     """
     if fitted.model.servos:
         raise ExportError(

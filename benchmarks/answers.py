@@ -7,31 +7,23 @@ of the first run, and without the last two recordings, which no other program ma
 """
 
 import argparse
-import os
-import platform
 import shutil
 import subprocess
 import sys
 import tempfile
-from datetime import date
 from pathlib import Path
-from typing import NamedTuple
 
-from planted_make import ROOT
+from runner import ROOT, SHARED, Ran, made, nnap_em
 
 sys.path.append(str(ROOT / "examples"))
 import plant
 import tanks
 
-from nnap_em.base.files import cores, replace_text
-from nnap_em.cli.common import MISFIT_STATUS
-
-NNAP_EM = [sys.executable, "-m", "nnap_em.cli.main"]
-DATA = ROOT.parent / "shared" / "data"
+from nnap_em.base.files import replace_text
 
 
 def _paper(folder: Path) -> None:
-    subprocess.run([*NNAP_EM, "simulate", str(folder)], check=True)
+    subprocess.run([sys.executable, "-m", "nnap_em.cli.main", "simulate", str(folder)], check=True)
 
 
 def _slide(folder: Path) -> None:
@@ -39,11 +31,11 @@ def _slide(folder: Path) -> None:
 
 
 def _tanks(folder: Path) -> None:
-    tanks.write(tanks.recordings(DATA / "ode" / "cascaded_tanks"), folder)
+    tanks.write(tanks.recordings(SHARED / "ode" / "cascaded_tanks"), folder)
 
 
 def _stored(name: str):
-    return lambda folder: shutil.copytree(DATA / name, folder, copy_function=shutil.copyfile)
+    return lambda folder: shutil.copytree(SHARED / name, folder, copy_function=shutil.copyfile)
 
 
 JOBS = {
@@ -57,33 +49,14 @@ JOBS = {
 """Command, and what writes its data set."""
 
 
-class Run(NamedTuple):
-    """One process."""
-
-    seconds: float
-    """Processor time of the process [s]."""
-    programs: int
-    """Programs that it put into the cache."""
-    memory: float
-    """Largest memory of the process [GB]."""
-    answer: str
-
-
-def run(command: str, folder: Path, out: Path, cache: Path) -> Run:
-    """A command on a data set, in a process of its own."""
+def run(command: str, folder: Path, out: Path, cache: Path) -> tuple[Ran, int, str]:
+    """A command on a data set, the number of programs that it put into the cache, and its answer."""
     before = len([*cache.rglob("*-cache")])
-    with out.with_suffix(".log").open("w+") as said:
-        words = [*NNAP_EM, command, str(folder), "--out", str(out)]
-        environment = os.environ | {"XDG_CACHE_HOME": str(cache), "PYTHONPATH": str(ROOT)}
-        process = subprocess.Popen(words, env=environment, stdout=said, stderr=said)
-        _, status, used = os.wait4(process.pid, 0)
-        said.seek(0)
-        lines = said.read().splitlines()
-    if os.waitstatus_to_exitcode(status) not in (0, MISFIT_STATUS):
-        raise RuntimeError("\n".join([" ".join(words), *lines]))
-    answer = [line.removeprefix("nnap-em: ") for line in lines if line.startswith("nnap-em: ")][-2]
-    new = len([*cache.rglob("*-cache")]) - before
-    return Run(used.ru_utime + used.ru_stime, new, used.ru_maxrss / 1e6, answer)
+    ran = nnap_em(command, folder, out=out, cache=cache)
+    if not ran.report:
+        raise RuntimeError("\n".join([f"{command} {folder}", *ran.said]))
+    answer = [line.removeprefix("nnap-em: ") for line in ran.said if line.startswith("nnap-em: ")][-2]
+    return ran, len([*cache.rglob("*-cache")]) - before, answer
 
 
 def main() -> None:
@@ -96,8 +69,7 @@ def main() -> None:
         "# Time to an answer\n",
         "Seconds of a processor. The first run finds no cached program, a later one those of the first; others are "
         "recordings of the same machine, two fewer.\n",
-        f"{date.today()}, {platform.machine()}, {cores()} cores, Python {platform.python_version()}; "
-        "written by `benchmarks/answers.py`.\n",
+        made(),
         "| job | first [s] | programs | memory [GB] | later [s] | others: [s], programs | answer |",
         "| --- | --- | --- | --- | --- | --- | --- |",
     ]
@@ -106,15 +78,18 @@ def main() -> None:
         with tempfile.TemporaryDirectory() as place:
             folder, cache = Path(place, "logs"), Path(place, "cache")
             make(folder)
-            first, later = (run(command, folder, Path(place, str(i)), cache) for i in range(2))
+            (first, programs, _), (later, _, answer) = (
+                run(command, folder, Path(place, str(i)), cache) for i in range(2)
+            )
             logs, others = sorted(folder.glob("train/*.csv")), "-"
             if len(logs) > 3:
                 for log in logs[-2:]:
                     log.unlink()
-                third = run(command, folder, Path(place, "2"), cache)
-                others = f"{third.seconds:.0f}, {third.programs}"
-        row = f"{first.seconds:.0f} | {first.programs} | {max(first.memory, later.memory):.1f} | {later.seconds:.0f}"
-        lines.append(f"| {command}, {name} | {row} | {others} | {later.answer} |")
+                third, more, _ = run(command, folder, Path(place, "2"), cache)
+                others = f"{third.processor_seconds:.0f}, {more}"
+        memory = max(first.memory, later.memory)
+        row = f"{first.processor_seconds:.0f} | {programs} | {memory:.1f} | {later.processor_seconds:.0f}"
+        lines.append(f"| {command}, {name} | {row} | {others} | {answer} |")
         print(lines[-1], flush=True)
     replace_text(args.table, "\n".join(lines) + "\n")
 

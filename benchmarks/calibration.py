@@ -9,11 +9,7 @@ velocities that were visited.  Drawn from the prior of the fit, its place in exa
 
 import argparse
 import dataclasses
-import os
-import platform
-import sys
 from collections.abc import Callable
-from datetime import date
 from functools import partial
 from typing import NamedTuple
 
@@ -22,6 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.stats
+from runner import made
 
 from nnap_em.estimate.identify import Identified, begin, friction_table, identify
 from nnap_em.machines.rig import Declared, Rig
@@ -123,10 +120,7 @@ def main() -> None:
     parser.add_argument("--draws", type=int, default=100)
     count = parser.parse_args().draws
     jax.config.update("jax_enable_x64", True)
-    print(
-        f"{date.today()}, {platform.machine()}, {len(os.sched_getaffinity(0))} cores, "
-        f"Python {platform.python_version()}, jax {jax.__version__}; `{' '.join(['python', *sys.argv])}`\n"
-    )
+    print(made())
     bench = slide_bench()
     print(
         "| truth drawn from | quantile of velocity | in its 50 % band | in its 90 % band [%] | RMS of z | uniform, p |"

@@ -18,10 +18,7 @@ import json
 import math
 import os
 import re
-import resource
 import shutil
-import subprocess
-import sys
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -30,31 +27,21 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from planted import _commit, score
 from planted_cases import case_of
-from planted_make import DATA, ROOT, make
+from planted_make import DATA, make
+from planted_table import score
+from runner import Ran, commit, nnap_em
 
 from nnap_em.base.files import replace_text
-from nnap_em.cli.common import MISFIT_STATUS
 from nnap_em.logs.formats import write_csv
 from nnap_em.machines.rig import Declared, write_rig
 from nnap_em.model.simulate import declared, examples, sweep_experiment
 
+CORE = min(os.sched_getaffinity(0))
 COLUMNS = "case", "in the recordings", "named", "right", "false", "outcome", "processor [s]", "commit"
 UNCERTAIN = {"slide": {"m": 0.1}, "pendulum": {"m": 0.05}, "acrobot": {"m2": 0.06}}
 """Numbers that are estimated, with the standard deviation that is declared [kg]."""
 FACTOR = {"coulomb": 1.2, "viscous": 1.2, "mass": 1.05}
-
-
-def command(*arguments: str | Path) -> tuple[int, float, str]:
-    """Exit status, processor seconds and last line of a command."""
-    environment = os.environ | {"JAX_NUM_CPU_DEVICES": "1", "PYTHONPATH": str(ROOT)}
-    before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    line = [sys.executable, "-m", "nnap_em.cli.main", *map(str, arguments)]
-    done = subprocess.run(line, env=environment, capture_output=True, text=True, check=False)
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    spent = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-    return done.returncode, spent, (done.stderr.strip().splitlines() or [""])[-1]
 
 
 def halves(source: Path, rig: Path, out: Path, odd: bool) -> None:
@@ -78,9 +65,13 @@ def fit_of(rig: str, out: Path) -> Path:
     if not (fit / "model.npz").exists():
         shutil.rmtree(out / "halves" / rig, ignore_errors=True)
         halves(DATA / rig, DATA / rig / "rig.toml", out / "halves" / rig, False)
-        status, spent, said = command("identify", out / "halves" / rig, "--out", fit, "--quiet")
-        replace_text(fit / "spent.json", json.dumps({"status": status, "seconds": spent, "said": said}))
+        nnap_em("identify", out / "halves" / rig, "--quiet", out=fit, core=CORE)
     return fit
+
+
+def _recorded(ran: Ran) -> dict[str, Any]:
+    outcome = {"report": ran.report} if ran.report else {"failed": (ran.said or [""])[-1]}
+    return outcome | {"seconds": ran.seconds, "processor_seconds": ran.processor_seconds}
 
 
 def planted(name: str, out: Path) -> dict[str, Any]:
@@ -90,10 +81,8 @@ def planted(name: str, out: Path) -> dict[str, Any]:
         truth = make(name, case)
         fit = fit_of(case_of(name).rig, out)
         halves(case, case / "rig.toml", half, True)
-        status, spent, said = command("diagnose", half, "--from", fit, "--out", found)
-        report = json.loads((found / "report.json").read_text()) if status in (0, MISFIT_STATUS) else None
-    record = {"case": name, "truth": truth, "seconds": spent, "processor_seconds": spent, "said": said}
-    return record | ({"report": report} if report else {"failed": said})
+        ran = nnap_em("diagnose", half, "--from", fit, out=found, core=CORE)
+    return {"case": name, "truth": truth} | _recorded(ran)
 
 
 def machine(system: str, kind: str):
@@ -138,19 +127,17 @@ def moved(name: str, out: Path) -> dict[str, Any]:
     before, fit = out / "sim" / f"{system}-{seed}", out / "fits" / f"sim-{system}-{seed}"
     if not (fit / "model.npz").exists():
         write(before, system, "none", 8, 300, 2 * int(seed))
-        command("identify", before, "--out", fit, "--quiet")
+        nnap_em("identify", before, "--quiet", out=fit, core=CORE)
     after, found = out / "sim" / name, out / "found" / name
     write(after, system, kind, 8, 300, 2 * int(seed) + 1)
-    status, spent, said = command("diagnose", after, "--from", fit, "--out", found)
-    report = json.loads((found / "report.json").read_text()) if status in (0, MISFIT_STATUS) else None
-    return {"case": name, "report": report, "seconds": spent, "said": said}
+    return {"case": name} | _recorded(nnap_em("diagnose", after, "--from", fit, out=found, core=CORE))
 
 
 def row(record: dict[str, Any]) -> list[str]:
     """A line of the table."""
     report = record.get("report") or {}
     named = "; ".join(effect["description"] for effect in report.get("effects", [])) or "nothing"
-    verdict = report.get("verdict") or record.get("failed") or record["said"]
+    verdict = report.get("verdict") or record["failed"]
     truth = "; ".join(
         f"{e['name']} {e.get('joint') or e.get('channel') or ''} {json.dumps(e['parameters'])}"
         for e in (record.get("truth") or {}).get("effects", [])
@@ -160,7 +147,7 @@ def row(record: dict[str, Any]) -> list[str]:
         done = score(record, {})
         right, false = f"{done.named} of {done.truths}", str(done.extras)
     code = str(record.get("code", ""))
-    return [record["case"], truth, named, right, false, verdict, f"{record['seconds']:.0f}", code]
+    return [record["case"], truth, named, right, false, verdict, f"{record['processor_seconds']:.0f}", code]
 
 
 def main() -> None:
@@ -186,7 +173,7 @@ def main() -> None:
     for name in args.cases:
         file = args.out / f"{args.command}-{name}.json"
         if not file.exists():
-            record = kinds[args.command](name, args.out) | {"code": _commit()}
+            record = kinds[args.command](name, args.out) | {"code": commit()}
             args.out.mkdir(parents=True, exist_ok=True)
             replace_text(file, json.dumps(record))
             print(" | ".join(row(record)), flush=True)

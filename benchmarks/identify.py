@@ -8,18 +8,15 @@ the data set (information of the linearised model, for the ten parameters of the
 """
 
 import argparse
-import os
-import platform
 import sys
 import time
-from datetime import date
-from pathlib import Path
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
+from runner import made
 
 from nnap_em.estimate.em.loop import Schedule, e_step, em_step
 from nnap_em.estimate.em.quadratic import local, quadratic, readings_at
@@ -155,7 +152,6 @@ def study(seed: int, name: str, tests: int, start_std: float) -> dict[str, float
     scores, hits = prediction_scores(fitted, test)
     truth_scores, _ = prediction_scores(truth_fit, test)
     law, net = cramer_rao(truth_fit, fitted, truth, CubatureSmoother, train.data, velocity, count, torque)
-    q, r = np.exp(0.5 * np.asarray(fitted.model.log_q)), np.exp(0.5 * np.asarray(fitted.model.log_r))
     return {
         "friction NRMSE joint 1": error[0],
         "friction NRMSE joint 2": error[1],
@@ -177,10 +173,6 @@ def study(seed: int, name: str, tests: int, start_std: float) -> dict[str, float
         "epochs": float(fitted.state.epoch),
         "seconds for these epochs": fit_s,
         "seconds to compile": compile_s,
-        "process noise sd of rates [rad/s], joint 1 (truth 0.01)": q[2],
-        "process noise sd of rates [rad/s], joint 2 (truth 0.01)": q[3],
-        "reading noise sd theta1 [rad] (truth 0.01)": r[0],
-        "reading noise sd dtheta1 [rad/s] (truth 0.05)": r[1],
     }
 
 
@@ -191,13 +183,9 @@ def main() -> None:
     parser.add_argument("--test", type=int, default=100)
     parser.add_argument("--smoother", nargs="+", choices=recipes, default=list(recipes))
     parser.add_argument("--start-std", type=float, default=0.5, help="declared std of theta2 in the first row [rad]")
-    parser.add_argument("--out", type=Path)
     args = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
-    lines = [
-        f"{date.today()}, {platform.machine()}, {len(os.sched_getaffinity(0))} cores, "
-        f"Python {platform.python_version()}, jax {jax.__version__}; `{' '.join(['python', *sys.argv])}`",
-    ]
+    lines = [made()]
     for name in args.smoother:
         rows = []
         for seed in range(args.seeds):
@@ -207,10 +195,7 @@ def main() -> None:
         for key in rows[0]:
             values = [row[key] for row in rows]
             lines.append(f"| {key} | {np.median(values):.4g} | {min(values):.4g} | {max(values):.4g} |")
-    text = "\n".join(lines) + "\n"
-    print(text)
-    if args.out:
-        args.out.write_text(text)
+    print("\n".join(lines))
 
 
 if __name__ == "__main__":

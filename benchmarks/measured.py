@@ -7,15 +7,13 @@ Smoothing is scored against the encoder that a `*_joint1` rig does not show (fol
 """
 
 import argparse
-import os
-import platform
 import sys
 import time
-from datetime import date
 from pathlib import Path
 
 import jax
 import numpy as np
+from runner import SHARED, made
 
 from nnap_em.estimate.identify import identify, parameter_table
 from nnap_em.estimate.predict import posterior_of, predict
@@ -85,16 +83,12 @@ def study(folder: Path, seed: int) -> dict:
 def main() -> None:
     """Run the rigs and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    root = Path(__file__).resolve().parent.parent
     parser.add_argument("rigs", nargs="*", default=RIGS)
-    parser.add_argument("--data", type=Path, default=root.parent / "shared" / "data" / "measured")
+    parser.add_argument("--data", type=Path, default=SHARED / "measured")
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
-    print(
-        f"{date.today()}, {platform.machine()}, {len(os.sched_getaffinity(0))} cores, "
-        f"Python {platform.python_version()}, jax {jax.__version__}; `{' '.join(['python', *sys.argv])}`\n"
-    )
+    print(made())
     heads = ["rig", "theta2 smoothed, RMSE per test recording [rad]", "0.2 s theta1 / theta2", "0.5 s theta1 / theta2"]
     heads += ["plain refit 0.2 s; 0.5 s", "left out of the fit", "epochs, seconds"]
     print("| " + " | ".join(heads) + " |")

@@ -5,17 +5,13 @@ python benchmarks/mutation.py [--share 1/1] [--tests test_em.py test_mstep.py]
 
 import argparse
 import csv
-import os
-import platform
 import sys
 import tempfile
-from datetime import date
 from pathlib import Path
-
-import jax
 
 sys.path.append(str(Path(__file__).resolve().parents[1] / "tests"))
 from mutants import MUTANTS, copy, run
+from runner import made
 
 
 def main() -> None:
@@ -26,10 +22,7 @@ def main() -> None:
     args = parser.parse_args()
     first, every = map(int, args.share.split("/"))
     share = [mutant for mutant in MUTANTS[first - 1 :: every] if mutant.test.startswith(tuple(args.tests))]
-    print(
-        f"{date.today()}, {platform.machine()}, {len(os.sched_getaffinity(0))} cores, "
-        f"Python {platform.python_version()}, jax {jax.__version__}; `{' '.join(['python', *sys.argv])}`\n"
-    )
+    print(made())
     tests = sorted({mutant.test for mutant in share})
     with tempfile.TemporaryDirectory() as folder:
         sound = run(copy(Path(folder)), *tests)

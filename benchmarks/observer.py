@@ -5,22 +5,18 @@ python benchmarks/observer.py [--table docs/results/observer.md]     # some minu
 
 import argparse
 import itertools
-import os
-import platform
-import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Iterator
-from datetime import date
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from observer_c import held, paper_rig, play, replay, rough
+from runner import made
 
-import nnap_em
 from nnap_em.estimate.identify import Identified, identify
 from nnap_em.estimate.observer import RESTARTED, Observer, functions, observer, restart_prior
 from nnap_em.estimate.store import load, save
@@ -103,10 +99,7 @@ def main() -> int:
         train = paper_experiment(truth, 20, 499, key=jax.random.key(48)).data
         save(args.fit, identify(paper_rig(), train, key=jax.random.key(0)))
     fitted = load(args.fit)
-    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False)
-    where = f"{date.today()}, {platform.machine()}, {os.cpu_count()} cores that other programs used as well, "
-    where += f"nnap_em {nnap_em.__version__}, commit {commit.stdout.strip()}."
-    print(where)
+    print(made())
     table = ["| | |", "| --- | --- |"]
     with tempfile.TemporaryDirectory() as name:
         parts = [accuracy(fitted, truth, args.sequences), alike(fitted, truth, args.rows, Path(name))]
@@ -115,8 +108,7 @@ def main() -> int:
             print(table[-1], flush=True)
     if args.table:
         head = args.table.read_text().partition("<!-- table -->")[0] if args.table.exists() else ""
-        command = f"`python benchmarks/observer.py {' '.join(sys.argv[1:])}`"
-        args.table.write_text("\n".join([f"{head}<!-- table -->", "", where, command, "", *table, ""]))
+        args.table.write_text("\n".join([f"{head}<!-- table -->", "", made(), *table, ""]))
     return 0
 
 

@@ -16,10 +16,8 @@ import fnmatch
 import json
 import os
 import queue
-import subprocess
 import sys
 import tempfile
-import threading
 import time
 import tomllib
 from concurrent.futures import ThreadPoolExecutor
@@ -28,52 +26,32 @@ from typing import Any
 
 import numpy as np
 from planted_cases import CASES, split
-from planted_make import ROOT, make
+from planted_make import make
 from planted_table import cases, score, table
+from runner import commit, nnap_em
 
 from nnap_em.base.files import replace_text
-from nnap_em.cli.common import MISFIT_STATUS
 
 
 def run(name: str, out: Path, limit: float, core: int) -> dict[str, Any]:
-    """`nnap-em diagnose` on a case in a process of its own on one core, ended after `limit` [s]; writes and returns the
-    record.
-    """
+    """`nnap-em diagnose` on a case on one core, ended after `limit` [s]; writes and returns the record."""
     with tempfile.TemporaryDirectory() as folder:
-        case, result = Path(folder, "case"), Path(folder, "found")
-        record: dict[str, Any] = {"case": name, "truth": make(name, case), "code": _commit()}
+        case = Path(folder, "case")
+        record: dict[str, Any] = {"case": name, "truth": make(name, case), "code": commit()}
         record["log_seconds"] = sum(
             sum(1 for _ in path.open()) * tomllib.loads((case / "rig.toml").read_text())["sampling"]["dt"]
             for path in case.glob("train/*.csv")
         )
-        alone = {"JAX_NUM_CPU_DEVICES": "1", "OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
-        command = [sys.executable, "-m", "nnap_em.cli.main", "diagnose", str(case), "--out", str(result), "--quiet"]
-        began = time.perf_counter()
-        with Path(folder, "said").open("w+") as said:
-            process = subprocess.Popen(command, env=os.environ | alone, stdout=said, stderr=said)
-            os.sched_setaffinity(process.pid, {core})
-            (end := threading.Timer(limit, process.kill)).start()
-            _, status, used = os.wait4(process.pid, 0)
-            end.cancel()
-            said.seek(0)
-            last = (said.read().strip().splitlines() or [""])[-1]
-        record["seconds"] = time.perf_counter() - began
-        record["processor_seconds"] = used.ru_utime + used.ru_stime
-        status = os.waitstatus_to_exitcode(status)
-        if status in (0, MISFIT_STATUS):
-            record["report"] = json.loads((result / "report.json").read_text())
-        else:
-            ended = record["seconds"] >= limit
-            record["failed"] = f"not done after {limit:.0f} s" if ended else f"status {status}: {last}"
+        ran = nnap_em("diagnose", case, "--quiet", out=Path(folder, "found"), core=core, limit=limit)
+    record |= {"seconds": ran.seconds, "processor_seconds": ran.processor_seconds}
+    if ran.report:
+        record["report"] = ran.report
+    else:
+        ended = f"status {ran.status}: {(ran.said or [''])[-1]}"
+        record["failed"] = f"not done after {limit:.0f} s" if ran.seconds >= limit else ended
     out.mkdir(parents=True, exist_ok=True)
     replace_text(out / f"{name}.json", json.dumps(record))
     return record
-
-
-def _commit() -> str:
-    """The commit that is run; empty outside a clone."""
-    command = ["git", "rev-parse", "--short", "HEAD"]
-    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False).stdout.strip()
 
 
 def records(folder: Path) -> list[dict[str, Any]]:

@@ -25,11 +25,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from planted_cases import STRENGTHS, WRONG, Body, Case, Columns, Motion, Plant, Ranges, Values, case_of, split
+from runner import SHARED
 
 from nnap_em.base.files import replace_text
 
-ROOT = Path(__file__).resolve().parent.parent
-DATA = ROOT.parent / "shared" / "data" / "measured"
+DATA = SHARED / "measured"
 STATES = ("theta1", "theta2", "dtheta1", "dtheta2")
 INPUTS = ("tau1", "tau2")
 MOMENTS = 8

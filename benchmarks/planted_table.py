@@ -10,14 +10,12 @@ standard deviations.  An error is that of all measured angles together, root of 
 import csv
 import io
 import math
-import os
-import platform
 import statistics
 from collections.abc import Iterable, Mapping, Sequence
-from datetime import date
 from typing import Any, NamedTuple
 
 from planted_cases import LAWS, STRENGTHS, WRONG, Law
+from runner import made
 
 Entry = Mapping[str, Any]
 Place = tuple[str, int | None, str | None]
@@ -65,7 +63,6 @@ CASE_COLUMNS = (
     "found",
     "right",
     "error at 0.25, 0.5, 1 s: before / after / unplanted [rad]",
-    "log ratio",
     "s of a processor",
 )
 
@@ -114,14 +111,6 @@ class Score(NamedTuple):
         if not (errors and self.unplanted):
             return math.nan
         return max(error / base for error, base in zip(errors, self.unplanted, strict=True))
-
-    @property
-    def ratio(self) -> float:
-        """How much of the error that the effect adds is gone: 1 is a machine predicted as without the effect."""
-        if not (self.before and self.after and self.unplanted):
-            return math.nan
-        before, after, unplanted = (e[DECIDES] for e in (self.before, self.after, self.unplanted))
-        return math.log(before / after) / math.log(before / unplanted) if before > 1.05 * unplanted else math.nan
 
 
 def place(entry: Entry) -> Place:
@@ -297,13 +286,8 @@ def table(records: Sequence[Entry]) -> str:
         "joint 2 hidden": [s for s in planted if s.case in hidden],
         "all": planted,
     }
-    commits = sorted({r["code"] for r in records})
-    lines = [
-        f"{date.today()}, {platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}, "
-        f"commit {', '.join(commits)}; `python benchmarks/planted.py run --out OUT`",
-        "",
-    ]
-    lines += _head(GROUP_COLUMNS)
+    commits = ", ".join(sorted({r["code"] for r in records}))
+    lines = [made(of=commits, command="python benchmarks/planted.py run --out OUT"), *_head(GROUP_COLUMNS)]
     lines += [_group(group, title) for title, group in groups.items() if group]
     as_recorded = [s for s in scores.values() if s.strength == "none"]
     if as_recorded:
@@ -349,7 +333,6 @@ def _cells(record: Entry, s: Score) -> Sequence[str]:
     nothing = (math.nan,) * len(HORIZONS)
     sides = zip(*(side or nothing for side in (s.before, s.after, s.unplanted)), strict=True)
     error = ", ".join(" / ".join(f"{e:.3g}" for e in three) for three in sides)
-    ratio = f"{s.ratio:.2f}" if math.isfinite(s.ratio) else "-"
     return (
         s.case,
         s.split,
@@ -358,6 +341,5 @@ def _cells(record: Entry, s: Score) -> Sequence[str]:
         s.failed or reported or "nothing",
         mark,
         error,
-        ratio,
         f"{s.seconds:.0f}",
     )

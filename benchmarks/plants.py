@@ -7,21 +7,18 @@ Each case runs in a process of its own; its data set, report and what it said st
 """
 
 import argparse
-import json
-import os
 import shutil
-import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+from runner import ROOT, SHARED, made, nnap_em
 
-ROOT = Path(__file__).resolve().parents[1]
 sys.path.append(str(ROOT / "examples"))
-import tanks  # noqa: E402
+import tanks
 
-ODE = ROOT.parent / "shared" / "data" / "ode"
+ODE = SHARED / "ode"
 HEATERS = """format = 1
 name = "heaters"
 
@@ -94,21 +91,16 @@ def run(name: str, out: Path, core: int) -> str:
     for old in (folder, found):
         shutil.rmtree(old, ignore_errors=True)
     CASES[name](folder)
-    environment = os.environ | {"JAX_NUM_CPU_DEVICES": "1", "OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
-    command = [sys.executable, "-m", "nnap_em.cli.main", "diagnose", str(folder), "--out", str(found)]
-    with (out / f"{name}.log").open("w") as said:
-        process = subprocess.Popen(command, env=environment, stdout=said, stderr=said)
-        os.sched_setaffinity(process.pid, {core})
-        _, status, used = os.wait4(process.pid, 0)
-    seconds = used.ru_utime + used.ru_stime
-    if not (found / "report.json").exists():
-        return f"| {name} | status {os.waitstatus_to_exitcode(status)} | | {seconds:.0f} |"
-    report = json.loads((found / "report.json").read_text())
-    error, pairs = report.get("test_error") or {}, []
+    ran = nnap_em("diagnose", folder, out=found, core=core)
+    (out / f"{name}.log").write_text("\n".join(ran.said))
+    if not ran.report:
+        return f"| {name} | status {ran.status} | | {ran.processor_seconds:.0f} |"
+    report, pairs = ran.report, []
+    error = report.get("test_error") or {}
     for column, before in error.get("before", {}).items():
         pairs.append(f"{column} {before[-1]:.3g} -> {error['after'][column][-1]:.3g}")
     horizon = f" ({error['horizons_s'][-1]:.3g} s)" if pairs else ""
-    return f"| {name} | {report['verdict']} | {'; '.join(pairs)}{horizon} | {seconds:.0f} |"
+    return f"| {name} | {report['verdict']} | {'; '.join(pairs)}{horizon} | {ran.processor_seconds:.0f} |"
 
 
 def main() -> None:
@@ -119,6 +111,7 @@ def main() -> None:
     parser.add_argument("--core", type=int, default=0)
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)
+    print(made())
     print("| plant | what is said | errors before and after | s of a processor |\n| --- | --- | --- | --- |")
     for name in arguments.cases or CASES:
         print(run(name, arguments.out, arguments.core), flush=True)

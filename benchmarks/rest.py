@@ -8,16 +8,13 @@ friction changes.
 """
 
 import argparse
-import os
-import platform
-import sys
 import time
-from datetime import date
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from runner import made
 
 from nnap_em.estimate.identify import friction_table, identify
 from nnap_em.logs.dataset import Dataset, pad
@@ -36,7 +33,6 @@ class Machine(NamedTuple):
     viscous: float
     smooth: float
     noise: float
-    offset: float = 0.0
 
     @property
     def inertia(self) -> float:
@@ -52,7 +48,7 @@ class Machine(NamedTuple):
 
     def friction(self, v):
         """Torque against motion [N m, or N]."""
-        return self.coulomb * np.tanh(v / self.smooth) + self.viscous * v + self.offset
+        return self.coulomb * np.tanh(v / self.smooth) + self.viscous * v
 
     def rig(self) -> Rig:
         """Its declaration: all but friction and noise."""
@@ -159,10 +155,7 @@ def main() -> None:
     parser.add_argument("--only", choices=tuple(MACHINES), help="one machine")
     args = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
-    print(
-        f"{date.today()}, {platform.machine()}, {len(os.sched_getaffinity(0))} cores, "
-        f"Python {platform.python_version()}, jax {jax.__version__}; `{' '.join(['python', *sys.argv])}`\n"
-    )
+    print(made())
     print(
         "| machine | at rest | seed | friction error / Coulomb | truth inside 2 std | Coulomb, fitted over true",
         end=" ",

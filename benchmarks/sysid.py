@@ -16,11 +16,8 @@ are positive (published ones are not).  The coupled rotors are armatures of join
 
 import argparse
 import contextlib
-import os
-import platform
 import sys
 import time
-from datetime import date
 from pathlib import Path
 from typing import NamedTuple
 
@@ -29,6 +26,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 from mujoco import rollout, sysid
+from runner import SHARED, made
 
 from nnap_em.estimate.identify import Identified, identify
 from nnap_em.estimate.predict import predict
@@ -261,18 +259,14 @@ def study(folder: Path, *, alone: bool) -> list[list[str]]:
 def main() -> None:
     """Print the table."""
     arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    root = Path(__file__).resolve().parent.parent
     arguments.add_argument("rigs", nargs="*", default=RIGS)
-    arguments.add_argument("--data", type=Path, default=root.parent / "shared" / "data" / "measured")
+    arguments.add_argument("--data", type=Path, default=SHARED / "measured")
     arguments.add_argument("--alone", action="store_true", help="without the peer's rows")
     args = arguments.parse_args()
     if not args.data.is_dir():
         sys.exit(f"error: {args.data} is not there: the recordings are no part of the repository")
     jax.config.update("jax_enable_x64", True)
-    print(
-        f"{date.today()}, {platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}, "
-        f"jax {jax.__version__}, mujoco {mujoco.__version__}; `{' '.join(['python', *sys.argv])}`\n"
-    )
+    print(made("mujoco-core"))
     heads = ["rig", "starts", "fitted by", "theta1 / theta2 at 0.25; 0.5; 1 s, root mean square [rad]", "median", "s"]
     print(f"| {' | '.join(heads)} |\n|{' --- |' * len(heads)}")
     for name in args.rigs:

@@ -7,19 +7,15 @@ Peers come with `pip install .[bench]`; a peer that is not installed has no row.
 """
 
 import argparse
-import importlib.metadata
 import importlib.util
-import platform
-import subprocess
 import time
 from collections.abc import Callable
-from datetime import date
-from pathlib import Path
 
 import jax
 import numpy as np
 from common_work import Case, Size, common_logs, filter_case, one_start, paths_case, smoother_case, wide_bank
 from peers import cuthbert_case, cuthbert_exact, dynamax_case
+from runner import made
 
 from nnap_em.estimate.smoother.gaussian import CubatureSmoother, ExtendedKalmanSmoother
 from nnap_em.estimate.smoother.particle import Bootstrap, ExactBackward, Guided
@@ -111,13 +107,8 @@ def main() -> None:
     parser.add_argument("--only", nargs="+", choices=TABLES, default=list(TABLES))
     args = parser.parse_args()
     size = Size(3, 60, 200) if args.quick else Size(20, 500, 1000)
-    names = ["jax", *(name for name in ("dynamax", "cuthbert") if importlib.util.find_spec(name))]
-    versions = ", ".join(f"{name} {importlib.metadata.version(name)}" for name in names)
-    commit = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty"]
-    print(
-        f"{date.today()}, {platform.machine()}, {jax.device_count()} core, Python {platform.python_version()}, ", end=""
-    )
-    print(f"{versions}; commit {subprocess.check_output(commit, text=True).strip()}")
+    names = [name for name in ("dynamax", "cuthbert") if importlib.util.find_spec(name)]
+    print(made(*names))
     for name in args.only:
         title, cases = TABLES[name]
         print(f"\n## {title}\n", *lines(measured(cases(size), 3 if args.quick else 7)), sep="\n", flush=True)

@@ -208,9 +208,10 @@ def test_short_test_sequences_have_no_errors_beyond_their_end():
 def test_every_effect_is_explained(monkeypatch):
     """Under the name in the report, with words for no parameter that it lacks; a law of a user as far as it says."""
     for kind in catalogue.values():
-        assert catalogue[kind.key()].meaning and set(kind.words) <= set(kind.units)
-    assert catalogue["torsional_spring"].meaning in _text(WHOLE)
-    own = type("Wind", (), {"meaning": "", "words": {"k": "push"}})
+        assert kind.meaning and set(kind.words) <= set(kind.units), kind
+    text = _text(WHOLE | {"effects": [EFFECT | {"law": "one sided loss of tau1", "meaning": "Less one way."}]})
+    assert "One sided loss of tau1" in text and "Less one way." in text
+    own = type("Wind", (), {"words": {"k": "push"}})
     monkeypatch.setitem(catalogue, "wind", own)
     html = page(WHOLE | {"effects": [EFFECT | {"name": "wind", "description": "a wind"}]})
     assert "push (k)" in html and "<p>A wind.</p>" in html and "<p></p>" not in html

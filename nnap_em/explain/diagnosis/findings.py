@@ -243,7 +243,7 @@ def suspected(diagnosis: Diagnosis) -> list[dict[str, Any]]:
         text = f"{words(key)} would remove {share_of(share, 'the squared prediction error')}"
         by_chance = f"up to {chance:.0%}" if chance >= 0.005 else "less than 1%"
         text += f", where chance removes {by_chance}" if math.isfinite(chance) else ""
-        more = {"law": words(key), "description": text, "confirm": catalogue[key[0]].confirm}
+        more = {"description": text, "confirm": catalogue[key[0]].confirm}
         out.append(place_of(key) | {"share_of_error": share, "chance": chance} | more)
     return out
 
@@ -274,9 +274,10 @@ def entry(finding: Finding) -> dict[str, Any]:
     return {
         **({"shape": finding.shape.entry()} if finding.shape else {}),
         **place_of(key_of(finding.effect)),
+        "meaning": finding.effect.meaning,
         "parameters": {n: p._asdict() for n, p in finding.parameters.items()},
         "evidence": finding.evidence,
-        "equivalent": [{"name": catalogue[k[0]].key(), "joint": k[1], "channel": k[2]} for k in finding.equivalent],
+        "equivalent": [place_of(key) for key in finding.equivalent],
         "description": finding.sentence,
         "confirm": finding.effect.confirm,
     }

@@ -20,9 +20,10 @@ def key_of(effect: AbstractEffect) -> Key:
 
 
 def place_of(key: Key) -> dict[str, Any]:
-    """A law as the report names it."""
+    """A law as the report names it, and in words of its own."""
     name, joint, channel, inputs = key
-    return {"name": catalogue[name].key(), "joint": joint, "channel": channel, "inputs": list(inputs)}
+    place = {"joint": joint, "channel": channel, "inputs": list(inputs)}
+    return {"name": catalogue[name].key(), **place, "law": words(key)}
 
 
 def words(key: Key) -> str:

@@ -92,6 +92,7 @@ class OneSidedLoss(InputEffect):
     """u on one side of zero, (1 - loss) u on the other: below zero for side = -1, above for 1."""
 
     reported_as: ClassVar[str] = "unknown_function"
+    meaning: ClassVar[str] = "The drive delivers less one way than the other."
     confirm: ClassVar[str] = "Block the joint and measure its torque at one command, both ways."
     units: ClassVar[dict[str, str]] = {"loss": "-"}
     loss: Scalar

@@ -131,6 +131,7 @@ class LoadFriction(JointEffect):
     """
 
     reported_as: ClassVar[str] = "unknown_function"
+    meaning: ClassVar[str] = "Friction of a gear that grows with the torques through it."
     confirm: ClassVar[str] = "Lift and lower a weight slowly: the torques differ by twice the friction, at each weight."
     units: ClassVar[dict[str, str]] = {
         **dict.fromkeys(("mu", "mu_load", "mu_stribeck", "mu_load_stribeck"), "-"),

@@ -215,6 +215,7 @@ class PeriodicForce(JointEffect):
     """sum_h s_h sin(2 pi h f t) + c_h cos(2 pi h f t): its period is found first, then its waveform."""
 
     reported_as: ClassVar[str] = "unknown_function"
+    meaning: ClassVar[str] = "Something pushes the joint periodically."
     confirm: ClassVar[str] = "Log the motion at rest with the drives off: what beside the machine pushes in time?"
     units: ClassVar[dict[str, str]] = {"size": "N m", "frequency": "Hz"}
     arguments: ClassVar[tuple[str, ...]] = ("time",)

@@ -62,8 +62,8 @@ def _found(document: _Entry) -> list[Part | None]:
 
 def _effect(effect: _Entry, doubted: bool) -> Section | None:
     law, text = catalogue.get(effect.get("name") or ""), effect.get("description") or ""
-    meaning, words = (law.meaning, law.words) if law else ("", {})
-    if "±" in text and meaning and not effect.get("shape") and effect.get("name") != "unknown_function":
+    meaning, words = effect.get("meaning") or "", law.words if law else {}
+    if "±" in text and meaning and not effect.get("shape"):
         text = ""  # numbers that the table has
     rows = [
         [f"{words[key]} ({key})" if words.get(key, key) != key else key, quantity(entry)]

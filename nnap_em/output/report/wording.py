@@ -52,7 +52,7 @@ def duration(error: Mapping[str, Any], value: float) -> str:
 def label(effect: Mapping[str, Any]) -> str:
     """An effect, or what else has a name, a joint, a channel and inputs, as a reader would call it."""
     name, joint, channel, inputs = (effect.get(part) for part in ("name", "joint", "channel", "inputs"))
-    return words((str(name or "unnamed"), joint, channel, tuple(inputs or ())))
+    return effect.get("law") or words((str(name or "unnamed"), joint, channel, tuple(inputs or ())))
 
 
 def sentence(text: Any) -> str:

@@ -2,7 +2,7 @@
 
     python benchmarks/plants.py --out out/plants [--core 0] [CASE ...]
 
-Each case runs in a process of its own; its data set, report and what it said stay in the folder of --out.  Records of
+Each case runs in a process of its own; its data set, report and output stay in the folder of --out.  Records of
 `test/` give the errors alone.  The data lie in ../shared/data/ode, whose README names their sources.
 """
 
@@ -96,7 +96,7 @@ def run(name: str, out: Path, core: int) -> str:
     if not ran.report:
         return f"| {name} | status {ran.status} | | {ran.processor_seconds:.0f} |"
     report, pairs = ran.report, []
-    error = report.get("test_error") or {}
+    error = report["error"] or {}
     for column, before in error.get("before", {}).items():
         pairs.append(f"{column} {before[-1]:.3g} -> {error['after'][column][-1]:.3g}")
     horizon = f" ({error['horizons_s'][-1]:.3g} s)" if pairs else ""

@@ -1,4 +1,4 @@
-"""What benchmarks share: where the recordings are, a command in a process of its own, and the line above a table."""
+"""Parts that benchmarks share: the folder of recordings, a command in a process of its own, the line above a table."""
 
 import json
 import os

@@ -101,6 +101,14 @@ def test_a_law_by_many_steps_has_shares_and_one_that_was_read_off_has_nats():
     assert finding.curve is None and finding.shape is None and "shape" not in entry(finding)
 
 
+def test_a_law_without_a_word_of_its_own_in_the_report_keeps_its_name_and_meaning():
+    loss = catalogue["one_sided_loss"](jnp.asarray(0.1), side=1, column="tau1", joint=1)
+    (finding,) = findings(_closed(ARM, loss))
+    reported = entry(finding)
+    assert (reported["name"], reported["law"]) == ("unknown_function", "one sided loss of tau1 at joint 1")
+    assert reported["meaning"] == loss.meaning != catalogue["unknown_function"].meaning
+
+
 def _law(name: str) -> AbstractEffect:
     return catalogue[name](jnp.asarray(0.1), joint=2)
 

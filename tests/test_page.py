@@ -20,9 +20,10 @@ SVG = b'<?xml version="1.0"?>\n<svg width="360pt" height="200pt" xmlns="http://w
 VOID = {"meta", "img", "input"}
 EFFECT = {
     "name": "torsional_spring", "joint": 2, "channel": None, "inputs": [], "description": "torsional spring at joint 2",
+    "law": "torsional spring at joint 2",
     "parameters": {"k": {"value": 0.05995, "std": 0.00037, "unit": "N m/rad"}},
     "evidence": {"log_likelihood_gain": 1142.0, "share_of_error": None, "p_value": 0.0},
-    "equivalent": [{"name": "hard_stop", "joint": 1}],
+    "equivalent": [{"name": "hard_stop", "joint": 1, "law": "hard stop at joint 1"}],
 }  # fmt: skip
 TEST = {"p_value": 1e-4}
 PASSED = {"p_value": FAILS}
@@ -213,5 +214,5 @@ def test_every_effect_is_explained(monkeypatch):
     assert "One sided loss of tau1" in text and "Less one way." in text
     own = type("Wind", (), {"words": {"k": "push"}})
     monkeypatch.setitem(catalogue, "wind", own)
-    html = page(WHOLE | {"effects": [EFFECT | {"name": "wind", "description": "a wind"}]})
+    html = page(WHOLE | {"effects": [EFFECT | {"name": "wind", "law": "wind", "description": "a wind"}]})
     assert "push (k)" in html and "<p>A wind.</p>" in html and "<p></p>" not in html

@@ -20,7 +20,7 @@ def key_of(effect: AbstractEffect) -> Key:
 
 
 def place_of(key: Key) -> dict[str, Any]:
-    """A law as the report names it, and in words of its own."""
+    """Name of a law in the report, its place, and its name in words."""
     name, joint, channel, inputs = key
     place = {"joint": joint, "channel": channel, "inputs": list(inputs)}
     return {"name": catalogue[name].key(), **place, "law": words(key)}

@@ -140,7 +140,7 @@ def _band(laws: Sequence[Screened], band: int) -> list[Screened]:
 
 
 def reductions(shares: Sequence[float]) -> list[float]:
-    """Logs of the error without laws over that with them, by shares that go: where nearly all goes the rest counts."""
+    """Logs of the error without a law over that with it, from shares removed: where nearly all goes the rest counts."""
     return [-math.log1p(-share) for share in shares]
 
 

@@ -8,7 +8,7 @@ from ...explain.diagnosis.findings import growth
 from ...explain.diagnosis.statistics import FAILS
 from ...model.effects import catalogue
 from .html import Part, Picture, Section, Table, rendered, section
-from .wording import duration, label, quantity, ratio, reached, sentence, share
+from .wording import duration, quantity, ratio, reached, sentence, share
 
 _NATS = ((100, "Beyond doubt"), (30, "Very sure"), (10, "Sure"), (3, "Likely"))
 _SHARES = ((0.6, "Very sure"), (0.3, "Sure"), (0.15, "Likely"))
@@ -70,7 +70,7 @@ def _effect(effect: _Entry, doubted: bool) -> Section | None:
         for key, entry in (effect.get("parameters") or {}).items()
     ]
     evidence = " ".join(_evidence(effect.get("evidence") or {}, doubted))
-    return section(sentence(label(effect))[:-1], meaning, sentence(text), Table([], rows), evidence)
+    return section(sentence(effect["law"])[:-1], meaning, sentence(text), Table([], rows), evidence)
 
 
 def _evidence(evidence: _Entry, doubted: bool) -> Iterable[str]:
@@ -96,9 +96,9 @@ def _evidence(evidence: _Entry, doubted: bool) -> Iterable[str]:
 
 def _equivalents(effects: Sequence[_Entry]) -> list[Part]:
     same = [
-        f"{sentence(label(effect))[:-1]}: the data cannot tell it from {' or '.join(map(label, effect['equivalent']))}."
+        f"{sentence(effect['law'])[:-1]}: the data cannot tell it from {' or '.join(e['law'] for e in others)}."
         for effect in effects
-        if effect.get("equivalent")
+        if (others := effect.get("equivalent"))
     ]
     return [same or "Nothing: no other effect that was tried explains these data nearly as well."] if effects else []
 

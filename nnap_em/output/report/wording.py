@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from typing import Any
 
 from ...base.digits import finite, number, share_of, ten, with_std
-from ...explain.diagnosis.keys import words
 
 
 def p_value(p: Any) -> str:
@@ -47,12 +46,6 @@ def quantity(entry: Mapping[str, Any]) -> str:
 def duration(error: Mapping[str, Any], value: float) -> str:
     """A time of the errors of a report with its unit."""
     return f"{number(value, 2)} {error.get('time_unit', 's')}"
-
-
-def label(effect: Mapping[str, Any]) -> str:
-    """An effect, or what else has a name, a joint, a channel and inputs, as a reader would call it."""
-    name, joint, channel, inputs = (effect.get(part) for part in ("name", "joint", "channel", "inputs"))
-    return effect.get("law") or words((str(name or "unnamed"), joint, channel, tuple(inputs or ())))
 
 
 def sentence(text: Any) -> str:

@@ -173,7 +173,7 @@ _spring = functools.partial(_screened, SPRING)
 
 def _run(entries, errors=None, own=None, hypothesis=BARE, shortlist=8, steps=None, p=None, late=math.inf):
     """A round over these candidates, and the names of those that were refitted in turn: a refit removes what the screen
-    said, or leaves `errors` by name, or in turn; along its own paths a law removes the same, or leaves `own`.  Of the
+    said, or leaves `errors` by name, or in turn; at its own scale a law removes the same, or leaves `own`.  Of the
     forms of a law it takes the one whose first number has the largest of `steps`.  The time is up before number `late`.
     """
     tried = []
@@ -183,19 +183,15 @@ def _run(entries, errors=None, own=None, hypothesis=BARE, shortlist=8, steps=Non
         law = screened.candidate.probes[0]
         if len(tried) >= late:
             raise TimeUp
-        own = errors[len(tried)] if isinstance(errors, tuple) else (errors or {}).get(law.name)
+        left = errors[len(tried)] if isinstance(errors, tuple) else (errors or {}).get(law.name)
         tried.append(law.name)
-        removed = screened.share.least if own is None else 1 - own
-        return Trial(screened, hypothesis.plus(law, screened.candidate), 0.5, removed)
-
-    def again(case):
-        if len(tried) >= late:
-            raise TimeUp
-        return 1 - own[case.effect.name] if own else case.removed
+        removed = screened.share.least if left is None else 1 - left
+        alone = 1 - own[law.name] if own else removed
+        return Trial(screened, hypothesis.plus(law, screened.candidate), 0.5, removed, alone)
 
     risen, step = None if p is None else Risen(1.2, p, 1e-4), Step(9, (), (), None)
     with mock.patch.object(rounds, "SHORTLIST", shortlist):
-        return decided(entries, refitted, again, step, hypothesis.model, CONTEXT._replace(risen=risen)), tried
+        return decided(entries, refitted, step, hypothesis.model, CONTEXT._replace(risen=risen)), tried
 
 
 SPRUNG = {"hypothesis": BARE.plus(SPRING, _candidate(SPRING))}
@@ -235,12 +231,10 @@ ROUNDS = {  # what the screen says, options, the laws that are refitted in turn,
     "another cause explaining the same": ([_gain(0.5), _spring(0.5)], {"errors": {HOOKE: 0.54}}, [GAIN, HOOKE], None),
     "another cause explaining less": ([_gain(0.5), _spring(0.5)], {"errors": {HOOKE: 0.56}}, [GAIN, HOOKE], GAIN),
     "the same cause": ([_gain(0.5), _zone(0.5)], {}, [GAIN, ZONE], GAIN),
-    # refits from the path without a law put another first than the screen: their own paths decide
-    "another law along its own path": ([_zone(0.5), _gain(0.4)], UNSURE | {"own": {ZONE: 0.2, GAIN: 0.25}}, PAIR, ZONE),
-    "the same along its own path": ([_zone(0.5), _gain(0.4)], UNSURE | {"own": {ZONE: 0.2, GAIN: 0.19}}, PAIR, GAIN),
-    "even along their own paths": ([_zone(0.5), _gain(0.4)], UNSURE | {"own": {ZONE: 0.2, GAIN: 0.22}}, PAIR, GAIN),
-    "not followed along its own": ([_zone(0.5), _gain(0.4)], UNSURE | {"own": {ZONE: math.inf, GAIN: 0.9}}, PAIR, GAIN),
-    "no time for their own paths": ([_zone(0.5), _gain(0.4)], UNSURE | {"late": 2}, PAIR, GAIN),
+    # refits put another first than the screen: what each removes at the scale of what it leaves decides
+    "another law at its own scale": ([_zone(0.5), _gain(0.4)], UNSURE | {"own": {ZONE: 0.2, GAIN: 0.25}}, PAIR, ZONE),
+    "the same at its own scale": ([_zone(0.5), _gain(0.4)], UNSURE | {"own": {ZONE: 0.2, GAIN: 0.19}}, PAIR, GAIN),
+    "even at their own scales": ([_zone(0.5), _gain(0.4)], UNSURE | {"own": {ZONE: 0.2, GAIN: 0.22}}, PAIR, GAIN),
     # the screen gives the second joint less than nine tenths of the first: refits decide at which joint it is
     "a law at its other joint": (
         [_gain(0.6), _gain(0.53, joint=2)], {"errors": (0.35, 0.27)}, [GAIN, GAIN], (GAIN, 2, None, ())),

@@ -36,6 +36,8 @@ class Trial(NamedTuple):
     removed: float = np.nan
     """Shares of the squared error of the refitted hypothesis without it, at the horizons by which its band is judged,
     that the step of the screen removes, and its refit."""
+    own: float = np.nan
+    """The share that the refit removes at the robust scale of what it leaves, not of what was there."""
     before: float = -np.inf
     """Share of the squared error that it removes from the recordings of the fit from which the search began."""
 
@@ -98,7 +100,8 @@ def with_candidate(forms: Sequence[Screened], null: Fitted, fit: SmoothedFit) ->
     trial, start = leader(map(stepped, forms))
     end = fitted(start, fit)
     removed = 1 - ratio(null.along, end.along, fit.used, trial.screened.band)
-    return trial._replace(after=end.hypothesis, removed=removed)
+    own = 1 - 1 / ratio(end.along, null.along, fit.used, trial.screened.band)
+    return trial._replace(after=end.hypothesis, removed=removed, own=own)
 
 
 def certainty(candidate: Candidate, effect: AbstractEffect, cov: Float[np.ndarray, "param param"]) -> float:

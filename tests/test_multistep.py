@@ -213,6 +213,15 @@ def test_a_ratio_of_errors_is_that_of_the_sequences_used():
     assert ratio(gone, ran, used) == pytest.approx(0.25)  # what was not read says nothing
 
 
+def test_a_few_large_errors_weigh_less_at_the_scale_of_the_others():
+    """Nine of ten errors fall to a tenth: at the old scale squares count, at the new one the last is on a line."""
+    before = np.ones((1, 10, 1, 1))
+    after = np.where(np.arange(10) > 0, 0.1, 1.0)[None, :, None, None]
+    small, line = 1 / 1.4826**2, 2.0 * (2 * 10.0 / 1.4826 - 2.0)
+    assert ratio(before, after, np.ones(1, bool)) == pytest.approx(0.109)
+    assert ratio(before, after, np.ones(1, bool), own=True) == pytest.approx((9 * small + line) / (10 * line))
+
+
 def test_all_measured_coordinates_must_be_white_or_where_none_is_measured_one_reading():
     """A system of two coordinates has these at places 0 and 1 of what can be read, and its rates at 2 and 3."""
     rng = np.random.default_rng(3)

@@ -273,10 +273,12 @@ def huber(error, scale, bend: float = HUBER_STD):
     return np.where(size < bend, size**2, bend * (2 * size - bend))
 
 
-def ratio(before, after, used: Bool[np.ndarray, " seq"]) -> float:
-    """Robust squared error of one model over that of another on the same starts, the mean over the horizons."""
+def ratio(before, after, used: Bool[np.ndarray, " seq"], *, own: bool = False) -> float:
+    """Robust squared error of one model over that of another on the same starts, the mean over the horizons; robust at
+    the scale of the first, or the second one's `own`.
+    """
     before, after = before[used], after[used]
-    known, scale = np.isfinite(before), robust_scale(before)
+    known, scale = np.isfinite(before), robust_scale(after if own else before)
     if not known.any():
         return 1.0
     after = np.where(np.isfinite(after), after, np.inf)

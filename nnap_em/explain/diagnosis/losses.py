@@ -69,13 +69,20 @@ def linearise(fit: SmoothedFit, blocks: Blocks) -> Iterator[tuple[Linearised, ..
 
 
 def ratio(
-    null: Followed, full: Followed, used: Bool[np.ndarray, " seq"], band: int, see: tuple[int, ...] = ()
+    null: Followed,
+    full: Followed,
+    used: Bool[np.ndarray, " seq"],
+    band: int,
+    see: tuple[int, ...] = (),
+    *,
+    own: bool = False,
 ) -> float:
     """Squared error of one fit over that of another, on the sequences `used`, at a band of horizons. Squares are
-    robust, each fit along its own smoothed paths; of the readings `see`, or those that are compared.
+    robust, at the scale of the first or of the second one's `own`, each fit along its own smoothed paths; of the
+    readings `see`, or those that are compared.
     """
     before, after = (multistep.errors(along, JUDGED_BANDS[band], see) for along in (null, full))
-    return multistep.ratio(before, after, used)
+    return multistep.ratio(before, after, used, own=own)
 
 
 def _flat(a: np.ndarray) -> np.ndarray:

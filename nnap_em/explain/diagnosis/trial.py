@@ -99,8 +99,8 @@ def with_candidate(forms: Sequence[Screened], null: Fitted, fit: SmoothedFit) ->
 
     trial, start = leader(map(stepped, forms))
     end = fitted(start, fit)
-    removed = 1 - ratio(null.along, end.along, fit.used, trial.screened.band)
-    own = 1 - 1 / ratio(end.along, null.along, fit.used, trial.screened.band)
+    band = trial.screened.band
+    removed, own = (1 - ratio(null.along, end.along, fit.used, band, own=own) for own in (False, True))
     return trial._replace(after=end.hypothesis, removed=removed, own=own)
 
 

@@ -35,8 +35,7 @@ refits decide between others, and between laws of different causes the question 
 EXCEEDS = 1.4
 """Log of the error without a law over that with it, after a refit over that of the screen, below which six of ten
 accepted laws on real arms lie. No law is accepted before all that may remove more are refitted: below 1.29 a saturation
-stands for a loss of torque on a real arm, above 1.53 a free function for Coulomb friction that grew. No value has all
-right: from 1.16 on a gain stands for a loss on another arm."""
+stands for a loss of torque on a real arm, above 1.53 a free function for Coulomb friction that grew."""
 WORSE = 2.0
 """Multiple of the squared error of a reading at some age from which on laws of equations harm it: heat from one real
 heater to the other makes it 1.3 times as large beside what else lacks, a wrong law on a ship 20 and 56 times."""

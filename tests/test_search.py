@@ -15,6 +15,7 @@ from helpers import around, declared_model, slide
 
 from nnap_em.base.deadline import TimeUp, until
 from nnap_em.base.journal import HERE, step
+from nnap_em.estimate.em import multistep
 from nnap_em.estimate.em.loop import EMState
 from nnap_em.estimate.em.recorded import Risen
 from nnap_em.estimate.identify import Identified
@@ -303,6 +304,20 @@ def test_a_refit_that_errs_more_than_its_start_is_not_kept(monkeypatch):
     for errs, kept in ((1.01, start), (0.99, end)):
         monkeypatch.setattr(trial, "ratio", lambda *_, errs=errs, **__: errs)
         assert trial.fitted(start, mock.Mock()) is kept
+
+
+def test_a_trial_has_the_share_at_the_scale_of_what_was_there_and_of_what_it_leaves(monkeypatch):
+    """Nine of ten errors fall to a tenth, as in test_multistep.py."""
+    after = np.where(np.arange(10) > 0, 0.1, 1.0)[None, :, None, None]
+    monkeypatch.setattr(trial, "begun", lambda hypothesis, path, fit: trial.Fitted(hypothesis, path, after))
+    monkeypatch.setattr(trial, "fitted", lambda start, fit: start)
+    monkeypatch.setattr(trial, "extended", lambda model, path, data: path)
+    monkeypatch.setattr(multistep, "errors", lambda along, *_: along)
+    null, fit = trial.Fitted(BARE, None, np.ones_like(after)), mock.Mock(hypothesis=BARE, used=np.ones(1, bool))
+    case = trial.with_candidate([_gain(0.5)], null, fit)
+    line = 2.0 * (2 * 10.0 / 1.4826 - 2.0)
+    assert 1 - case.removed == pytest.approx(0.109)
+    assert 1 - case.own == pytest.approx((9 / 1.4826**2 + line) / (10 * line))
 
 
 def test_laws_go_without_which_too_little_is_lost_the_least_first():
